@@ -1,0 +1,3 @@
+//! 2D laser mapping for robots on a Zenoh mesh.
+
+pub mod slam;

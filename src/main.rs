@@ -1,0 +1,2 @@
+//! The `gmapd` command.
+fn main() {}

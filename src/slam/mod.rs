@@ -1,0 +1,10 @@
+//! The pure core: no files, clocks, logging, async or global state.
+//!
+//! Stamps and odometry come in as values, randomness from a seed and counters, so the same input
+//! gives the same bytes on any machine and any number of threads.
+
+pub mod gmapping;
+pub mod motion_gate;
+pub mod odometry;
+pub mod pose;
+pub mod scan;
