@@ -1,3 +1,4 @@
 //! 2D laser mapping for robots on a Zenoh mesh.
 
+pub mod sim;
 pub mod slam;
