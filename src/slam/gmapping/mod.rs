@@ -136,6 +136,18 @@ pub struct MatcherParameters {
     pub hit_fraction: f64,
     /// experiment
     pub like_sigma: f64,
+    /// experiment
+    pub gap: f64,
+    /// experiment
+    pub sweep: u32,
+    /// experiment
+    pub sweep_step: f64,
+    /// experiment
+    pub sweep_bias: f64,
+    /// experiment
+    pub spacing: f64,
+    /// experiment
+    pub incidence: f64,
 }
 
 impl Default for MatcherParameters {
@@ -160,6 +172,12 @@ impl Default for MatcherParameters {
             cut: 0.1,
             hit_fraction: 0.9,
             like_sigma: 0.1,
+            gap: 0.5,
+            sweep: 0,
+            sweep_step: 0.1,
+            sweep_bias: 1.0,
+            spacing: 1.0,
+            incidence: 4.0,
         }
     }
 }
@@ -519,7 +537,7 @@ impl GMapping {
             let x = pose.x / resolution - f64::from(origin.ix);
             let y = pose.y / resolution - f64::from(origin.iy);
             let (sin, cos) = libm::sincos(pose.theta);
-            for (px, py) in scan.points.all.iter() {
+            for (px, py) in scan.surface.iter() {
                 let (px, py) = (f64::from(px), f64::from(py));
                 kernel.stamp(
                     &mut particle.field,
@@ -609,6 +627,7 @@ pub struct Particle {
 #[derive(Debug)]
 struct PreparedScan {
     points: MatchPoints,
+    surface: Points,
     outline: ScanOutline,
 }
 
@@ -640,10 +659,32 @@ impl PreparedScan {
         }
         let all: Points = hits.into_iter().step_by(parameters.matcher.beam_skip + 1).collect();
         let coarse = all.every(parameters.matcher.coarse_step);
+        let mut surface: Vec<(f32, f32)> = Vec::new();
+        let gap = parameters.matcher.gap / parameters.resolution;
+        let mut before: Option<(f64, f64)> = None;
+        let inc = geometry.angle_increment().abs();
+        for e in &ends {
+            let now = (e.kind == BeamEndKind::Hit).then(|| (f64::from(e.point[0]) / parameters.resolution, f64::from(e.point[1]) / parameters.resolution));
+            if let (Some(a), Some(b)) = (before, now) {
+                let d = ((a.0 - b.0).powi(2) + (a.1 - b.1).powi(2)).sqrt();
+                let r = (a.0 * a.0 + a.1 * a.1).sqrt().min((b.0 * b.0 + b.1 * b.1).sqrt());
+                if d > parameters.matcher.spacing && d < gap && d < parameters.matcher.incidence * r * inc {
+                    let k = (d / parameters.matcher.spacing).ceil();
+                    for i in 1..k as usize {
+                        let f = i as f64 / k;
+                        surface.push(((a.0 + f * (b.0 - a.0)) as f32, (a.1 + f * (b.1 - a.1)) as f32));
+                    }
+                }
+            }
+            if let Some(b) = now { surface.push((b.0 as f32, b.1 as f32)); }
+            before = now;
+        }
+        let surface: Points = surface.into_iter().collect();
         let radius = all.iter().map(|(x, y)| x.hypot(y)).fold(0.0, f32::max) as i32 + 1;
         let sensor = reading.mount.base_from_laser.position();
         Self {
             points: MatchPoints { all, coarse, radius },
+            surface,
             outline: ScanOutline {
                 sensor,
                 ends,

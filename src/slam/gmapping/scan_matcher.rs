@@ -121,6 +121,14 @@ impl FieldMatcher {
         let mut best = origin;
         let mut best_score = window.score(points, best);
         let mut level = 0;
+        let start = best;
+        for i in 1..=self.parameters.sweep {
+            for sign in [-1.0, 1.0] {
+                let pose = start.turned(sign * f64::from(i) * self.parameters.sweep_step);
+                let score = window.score(points, pose);
+                if f64::from(score) > self.parameters.sweep_bias * f64::from(best_score) { (best, best_score) = (pose, score); }
+            }
+        }
         while level < self.parameters.climb_levels {
             let moves = [
                 best.moved(step, 0.0),

@@ -11,7 +11,7 @@ use super::Cell;
 use super::tile_map::{TILE_CELLS, TILE_SIZE, Tile, TileKey, TileMap, index_in_tile};
 
 /// Sub-cell positions a kernel is tabulated for, along each axis.
-const PHASES: usize = 4;
+const PHASES: usize = 8;
 /// Beams whose cells are computed together before they are looked up.
 const BLOCK: usize = 64;
 /// Lanes of the floating-point sums; fixed, so that sums are the same on every machine.
