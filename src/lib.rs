@@ -1,7 +1,13 @@
 //! 2D laser mapping for robots on a Zenoh mesh.
 
-pub mod clock;
+pub mod slam;
+
+pub mod config;
+pub mod evaluation;
 pub mod files;
 pub mod logs;
 pub mod map;
-pub mod slam;
+
+pub mod clock;
+pub mod replay;
+pub mod statistics;

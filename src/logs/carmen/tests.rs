@@ -71,8 +71,8 @@ fn remissions_are_passed_over() {
 #[test]
 fn an_increment_rounded_to_six_decimals_gains_digits_from_the_field_of_view() {
     assert!((stated_increment(4.188_790, 0.006_151, 682) - 4.188_790 / 681.0).abs() < 1e-12);
-    assert!((stated_increment(3.141_593, 0.017_453, 180) - 3.141_593 / 180.0).abs() < 1e-12);
-    assert_eq!(stated_increment(3.141_593, 0.25, 180), 0.25);
+    assert!((stated_increment(1.745_329, 0.017_453, 100) - 1.745_329 / 100.0).abs() < 1e-12);
+    assert_eq!(stated_increment(3.0, 0.25, 180), 0.25);
     assert_eq!(stated_increment(3.0, 0.25, 1), 0.25);
 }
 
