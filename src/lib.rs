@@ -1,5 +1,6 @@
 //! 2D laser mapping for robots on a Zenoh mesh.
 
+pub mod sim;
 pub mod slam;
 
 pub mod config;

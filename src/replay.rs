@@ -7,7 +7,9 @@ mod summary;
 
 use std::time::Duration;
 
-pub use summary::{Counts, Hashes, PhaseTimes, Run, SampleSizes, Summary, Timing};
+pub use summary::{
+    Counts, Hashes, PhaseSplit, PhaseTimes, Run, SampleSizes, Summary, Tiles, Timing,
+};
 
 use crate::clock::{Elapsed, Stopwatch};
 use crate::config::Config;
@@ -61,11 +63,10 @@ impl Replay {
     /// Ends the replay: the map, and the trajectory as the best particle sees it now.
     #[must_use]
     pub fn finish(self) -> Outcome {
-        let path = self.filter.path();
         Outcome {
             map: self.filter.occupancy_grid(),
-            trajectory: self.track.corrected(&path),
-            path: path.into_iter().map(|(_, pose_in_map)| pose_in_map).collect(),
+            trajectory: self.track.corrected(&self.filter.path()),
+            tiles: self.filter.tile_counts().into(),
             counts: self.counts,
             sample_sizes: self.sample_sizes,
             resamples: self.resamples,
@@ -90,7 +91,7 @@ impl Replay {
     fn add_scan(&mut self, reading: &Reading, scan: &Scan) -> Verdict {
         let mount = self.mount.as_ref().unwrap_or(&reading.mount);
         let reading = ScanReading { scan, mount, odom_from_base: reading.odom_from_base };
-        let mut phases = [Elapsed::default(); PHASES.len()];
+        let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();
         let mut phase_watch = total;
         let update = self.filter.add_scan(&reading, &mut |phase| {
@@ -124,8 +125,8 @@ pub struct Outcome {
     pub map: Option<OccupancyGrid>,
     /// The pose of the base in `map` at every reading.
     pub trajectory: Vec<StampedPose>,
-    /// The pose of the base in `map` at every processed scan.
-    pub path: Vec<Pose2>,
+    /// Tiles of the particles' maps.
+    pub tiles: Tiles,
     /// Readings by verdict.
     pub counts: Counts,
     /// The effective sample size at every processed scan.
@@ -174,13 +175,8 @@ impl From<SkipReason> for Verdict {
     }
 }
 
-/// The phases of processing a scan, in order, with their names in the summary.
-pub const PHASES: [(Phase, &str); 4] = [
-    (Phase::Match, "match"),
-    (Phase::Resample, "resample"),
-    (Phase::Register, "register"),
-    (Phase::Map, "map"),
-];
+/// How many variants [`Phase`] has.
+const PHASES: usize = 4;
 
 const fn phase_index(phase: Phase) -> usize {
     match phase {
@@ -195,11 +191,11 @@ const fn phase_index(phase: Phase) -> usize {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ScanTimes {
     total: Times,
-    phases: [Times; PHASES.len()],
+    phases: [Times; PHASES],
 }
 
 impl ScanTimes {
-    fn add(&mut self, total: Elapsed, phases: [Elapsed; PHASES.len()]) {
+    fn add(&mut self, total: Elapsed, phases: [Elapsed; PHASES]) {
         self.total.add(total);
         for (times, elapsed) in self.phases.iter_mut().zip(phases) {
             times.add(elapsed);

@@ -71,13 +71,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let outcome = replay(&log, Replay::new(&config, threads))?;
     let elapsed = watch.elapsed();
 
-    let products = Products::of(&outcome)?;
-    let run = Run { config: &config, threads, log: log.statistics(), elapsed };
-    let summary = Summary::new(&run, &outcome, products.hashes());
-    let written = match &arguments.out {
-        Some(directory) => products.write(directory, &summary)?,
+    let products = Products::of(&outcome);
+    let mut written = match &arguments.out {
+        Some(directory) => products.write(directory, &outcome)?,
         None => Vec::new(),
     };
+    // Last, so that the peak of memory is that of the whole run.
+    let run = Run { config: &config, threads, log: log.statistics(), elapsed };
+    let summary = Summary::new(&run, &outcome, products.hashes());
+    if let Some(directory) = &arguments.out {
+        let path = directory.join("summary.json");
+        write_atomically(&path, json(&summary)?.as_bytes())?;
+        written.push(path);
+    }
     let text = if arguments.json { json(&summary)? } else { readable(&summary, &written) };
     std::io::stdout().lock().write_all(text.as_bytes()).context("cannot print the summary")
 }
@@ -115,48 +121,45 @@ fn replay(log: &CarmenLog, mut replay: Replay) -> anyhow::Result<Outcome> {
     Ok(replay.finish())
 }
 
-/// The files of a replay, in memory: their hashes are told even when they are not written.
+/// What is hashed even when it is not written.
 struct Products {
-    /// `map.pgm`, `map.yaml`, `map.png`.
-    map: Option<[Vec<u8>; 3]>,
+    /// `map.pgm`; none when no scan was processed.
+    map: Option<Vec<u8>>,
+    /// `trajectory.tum`.
     trajectory: Vec<u8>,
 }
 
 impl Products {
-    fn of(outcome: &Outcome) -> anyhow::Result<Self> {
-        let path: Vec<Point2> = outcome.path.iter().map(|pose| pose.position()).collect();
-        let map = match &outcome.map {
-            Some(grid) => {
-                let png = map::png(grid, &path).context("cannot draw map.png")?;
-                Some([map::pgm(grid), map::yaml(grid, "map.pgm").into_bytes(), png])
-            }
-            None => None,
-        };
-        Ok(Self { map, trajectory: tum(&outcome.trajectory).into_bytes() })
+    fn of(outcome: &Outcome) -> Self {
+        Self {
+            map: outcome.map.as_ref().map(map::pgm),
+            trajectory: tum(&outcome.trajectory).into_bytes(),
+        }
     }
 
     fn hashes(&self) -> Hashes {
-        Hashes {
-            map: self.map.as_ref().map(|[pgm, ..]| sha256(pgm)),
-            trajectory: sha256(&self.trajectory),
-        }
+        Hashes { map: self.map.as_deref().map(sha256), trajectory: sha256(&self.trajectory) }
     }
 
-    fn write(&self, directory: &Path, summary: &Summary) -> anyhow::Result<Vec<PathBuf>> {
-        let mut files: Vec<(&str, &[u8])> = Vec::new();
-        if let Some(map) = &self.map {
-            let names = ["map.pgm", "map.yaml", "map.png"];
-            files.extend(names.into_iter().zip(map.iter().map(Vec::as_slice)));
-        }
-        let summary = json(summary)?;
-        files.push(("trajectory.tum", &self.trajectory));
-        files.push(("summary.json", summary.as_bytes()));
+    fn write(&self, directory: &Path, outcome: &Outcome) -> anyhow::Result<Vec<PathBuf>> {
         let mut written = Vec::new();
-        for (name, bytes) in files {
+        let mut write = |name: &str, bytes: &[u8]| {
             let path = directory.join(name);
             write_atomically(&path, bytes)?;
             written.push(path);
+            anyhow::Ok(())
+        };
+        match (&self.map, &outcome.map) {
+            (Some(pgm), Some(grid)) => {
+                let path: Vec<Point2> =
+                    outcome.trajectory.iter().map(|reading| reading.pose.position()).collect();
+                write("map.pgm", pgm)?;
+                write("map.yaml", map::yaml(grid, "map.pgm").as_bytes())?;
+                write("map.png", &map::png(grid, &path).context("cannot draw map.png")?)?;
+            }
+            _ => eprintln!("warning: no scan was processed, so no map is written"),
         }
+        write("trajectory.tum", &self.trajectory)?;
         Ok(written)
     }
 }
@@ -187,12 +190,25 @@ fn readable(summary: &Summary, written: &[PathBuf]) -> String {
     if let Some(times) = &timing.scan {
         line("ms a scan", milliseconds(times));
     }
-    for (name, times) in &timing.phases {
-        line(&format!("  {name}"), milliseconds(times));
+    if let Some(phases) = &timing.phases {
+        line("  match", milliseconds(&phases.matching));
+        line("  resample", milliseconds(&phases.resample));
+        line("  register", milliseconds(&phases.register));
+        line("  map", milliseconds(&phases.map));
     }
     if let Some(bytes) = timing.peak_memory_bytes {
         line("peak memory", format!("{:.1} MB", bytes as f64 / 1e6));
     }
+    let tiles = &summary.tiles;
+    line(
+        "tiles",
+        format!(
+            "{} in {:.1} MB, shared by {:.1} particles on average",
+            tiles.distinct,
+            tiles.bytes as f64 / 1e6,
+            tiles.referenced as f64 / tiles.distinct.max(1) as f64
+        ),
+    );
     line("map SHA-256", summary.sha256.map.clone().unwrap_or_else(|| "no map".to_owned()));
     line("trajectory", summary.sha256.trajectory.clone());
     for path in written {

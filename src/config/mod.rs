@@ -83,6 +83,7 @@ impl Config {
                 gain: raw.gain,
                 smoothing: raw.weight_smoothing.into(),
                 resample_threshold: raw.resample_threshold,
+                ..Weighting::default()
             },
             map: MapParameters {
                 occupied_threshold: raw.occupied_threshold,
@@ -117,6 +118,7 @@ fn matcher_parameters(raw: &RawConfig) -> MatcherParameters {
         beam_skip: raw.beam_skip,
         minimum_score: raw.minimum_score,
         field_sigma: raw.field_sigma_m,
+        ..MatcherParameters::default()
     }
 }
 

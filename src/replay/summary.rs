@@ -4,10 +4,12 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{Outcome, PHASES, ScanTimes, Step, Times, Verdict};
+use super::{Outcome, ScanTimes, Step, Times, Verdict, phase_index};
 use crate::clock::{Elapsed, peak_resident_memory};
 use crate::config::{Config, RawConfig};
 use crate::logs::LogStatistics;
+use crate::slam::gmapping::Phase;
+use crate::slam::grid::tile_map::TileCounts;
 use crate::statistics::Spread;
 
 /// The figures of a replay; `summary.json` is this.
@@ -33,6 +35,8 @@ pub struct Summary {
     pub effective_sample_size: Option<SampleSizes>,
     /// Time and memory.
     pub timing: Timing,
+    /// Memory of the particles' maps at the end.
+    pub tiles: Tiles,
     /// SHA-256 of what was computed, whether or not it was written.
     pub sha256: Hashes,
     /// Every key of the configuration with the value that held.
@@ -56,6 +60,7 @@ impl Summary {
             resamples: outcome.resamples,
             effective_sample_size: SampleSizes::of(&outcome.sample_sizes),
             timing: Timing::new(run, &outcome.times),
+            tiles: outcome.tiles,
             sha256,
             configuration: run.config.raw.clone(),
         }
@@ -147,14 +152,13 @@ pub struct Timing {
     pub peak_memory_bytes: Option<u64>,
     /// Milliseconds a processed scan; `null` when there are none.
     pub scan: Option<PhaseTimes>,
-    /// Milliseconds of each phase of a processed scan.
-    pub phases: BTreeMap<&'static str, PhaseTimes>,
+    /// Milliseconds of each phase of a processed scan; `null` when there are none.
+    pub phases: Option<PhaseSplit>,
 }
 
 impl Timing {
     fn new(run: &Run<'_>, times: &ScanTimes) -> Self {
         let wall_s = run.elapsed.wall.as_secs_f64();
-        let phases = PHASES.iter().zip(&times.phases);
         Self {
             log_s: run.log.duration(),
             wall_s,
@@ -162,10 +166,34 @@ impl Timing {
             real_time_factor: run.log.duration() / wall_s.max(1e-9),
             peak_memory_bytes: peak_resident_memory(),
             scan: PhaseTimes::of(&times.total),
-            phases: phases
-                .filter_map(|((_, name), times)| Some((*name, PhaseTimes::of(times)?)))
-                .collect(),
+            phases: PhaseSplit::of(times),
         }
+    }
+}
+
+/// Milliseconds of each phase of a processed scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PhaseSplit {
+    /// Scan matching and weighting of all particles.
+    #[serde(rename = "match")]
+    pub matching: PhaseTimes,
+    /// Normalisation, resampling and the trajectory tree.
+    pub resample: PhaseTimes,
+    /// The scan enters each particle's map.
+    pub register: PhaseTimes,
+    /// The scan enters the output map.
+    pub map: PhaseTimes,
+}
+
+impl PhaseSplit {
+    fn of(times: &ScanTimes) -> Option<Self> {
+        let of = |phase| PhaseTimes::of(&times.phases[phase_index(phase)]);
+        Some(Self {
+            matching: of(Phase::Match)?,
+            resample: of(Phase::Resample)?,
+            register: of(Phase::Register)?,
+            map: of(Phase::Map)?,
+        })
     }
 }
 
@@ -181,6 +209,24 @@ pub struct PhaseTimes {
 impl PhaseTimes {
     fn of(times: &Times) -> Option<Self> {
         Some(Self { cpu_ms: Spread::of(&times.cpu_ms)?, wall_ms: Spread::of(&times.wall_ms)? })
+    }
+}
+
+/// Tiles of the particles' maps, which share those that are equal.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Tiles {
+    /// References to tiles, summed over the particles.
+    pub referenced: usize,
+    /// Tiles in memory.
+    pub distinct: usize,
+    /// Bytes of the tiles in memory.
+    pub bytes: usize,
+}
+
+impl From<TileCounts> for Tiles {
+    fn from(counts: TileCounts) -> Self {
+        let TileCounts { referenced, distinct, bytes } = counts;
+        Self { referenced, distinct, bytes }
     }
 }
 

@@ -4,6 +4,7 @@
 //! gives the same bytes on any machine and any number of threads.
 
 pub mod gmapping;
+pub mod grid;
 pub mod motion_gate;
 pub mod odometry;
 pub mod pose;

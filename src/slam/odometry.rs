@@ -1,8 +1,16 @@
-//! What the wheels say: the pose in `odom`, gathered between processed scans.
+//! What the wheels say, gathered between processed scans, and how far to trust it.
 
 use serde::{Deserialize, Serialize};
 
 use super::pose::Pose2;
+
+/// Metres of travel and radians of turn over which the noise parameters hold as given.
+///
+/// The original applies them to each message; these are the steps of a robot at about 0.5 m/s and
+/// 0.5 rad/s that reports at 5 to 10 Hz, as those did that the defaults were made for.
+const REFERENCE_STEP: f64 = 0.1;
+/// Share of the noise along an axis that travel along the other axis adds, as in the original.
+const CROSS_AXIS: f64 = 0.3;
 
 /// Standard deviations of the odometry, per metre and per radian of motion.
 ///
@@ -31,5 +39,52 @@ impl Default for MotionNoise {
     }
 }
 
-/// The pose of the base in the odometry frame at a scan or an odometry message.
-pub type OdomFromBase = Pose2;
+impl MotionNoise {
+    /// Standard deviations of `motion` along x and y (m) and of its turn (rad).
+    #[must_use]
+    pub fn standard_deviations(&self, motion: &Motion) -> [f64; 3] {
+        let deviation = |terms: [(f64, f64); 3]| {
+            let variance: f64 =
+                terms.iter().map(|(noise, amount)| noise * noise * amount * REFERENCE_STEP).sum();
+            variance.sqrt()
+        };
+        let along = self.translation_from_translation;
+        let across = CROSS_AXIS * along;
+        let turned = (self.translation_from_rotation, motion.turned);
+        [
+            deviation([(along, motion.forward), (across, motion.sideways), turned]),
+            deviation([(along, motion.sideways), (across, motion.forward), turned]),
+            deviation([
+                (self.rotation_from_translation, motion.forward + motion.sideways),
+                (self.rotation_from_rotation, motion.turned),
+                (0.0, 0.0),
+            ]),
+        ]
+    }
+}
+
+/// The motion of the base between two moments, as odometry tells it.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Motion {
+    /// The later base seen from the earlier one.
+    pub increment: Pose2,
+    /// Length of the path between them, m.
+    pub path_length: f64,
+    /// The part of the path along the base's x axis, either way, m.
+    pub forward: f64,
+    /// The part along its y axis, either way, m.
+    pub sideways: f64,
+    /// Radians turned, either way.
+    pub turned: f64,
+}
+
+impl Motion {
+    /// Goes on by `step`, the base after it seen from the base before it.
+    pub fn extend(&mut self, step: Pose2) {
+        self.increment = self.increment * step;
+        self.path_length += step.position().norm();
+        self.forward += step.x.abs();
+        self.sideways += step.y.abs();
+        self.turned += step.theta.abs();
+    }
+}

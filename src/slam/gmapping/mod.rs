@@ -1,10 +1,27 @@
 //! GMapping: a Rao-Blackwellized particle filter over trajectories and maps
 //! (Grisetti, Stachniss, Burgard, IEEE T-RO 23(1), 2007).
 
+pub mod motion_model;
+pub mod random;
+pub mod resampling;
+pub mod scan_matcher;
+pub mod trajectory;
+
+use std::collections::VecDeque;
+
+use nalgebra::Matrix3;
+
+use self::random::{Purpose, Streams};
+use self::scan_matcher::{FieldMatcher, MatchPoints};
+use self::trajectory::{NodeId, TrajectoryTree};
+use super::grid::Cell;
+use super::grid::likelihood_field::{Kernel, Points};
+use super::grid::occupancy::{BeamEnd, BeamEndKind, OccupancyMap, ScanOutline};
+use super::grid::tile_map::TileMap;
 use super::motion_gate::MotionGate;
-use super::odometry::MotionNoise;
-use super::pose::{Pose2, Stamp};
-use super::scan::{LaserMount, Scan};
+use super::odometry::{Motion, MotionNoise};
+use super::pose::{self, Pose2, Stamp};
+use super::scan::{Beam, LaserMount, Scan};
 
 /// Everything the filter can be told, grouped by the part that uses it.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,6 +118,24 @@ pub struct MatcherParameters {
     pub minimum_score: f64,
     /// Standard deviation of the likelihood field around each hit, m.
     pub field_sigma: f64,
+    /// experiment
+    pub known: u8,
+    /// experiment
+    pub climb_levels: u32,
+    /// experiment
+    pub polish_steps: u32,
+    /// experiment
+    pub damping: f64,
+    /// experiment
+    pub coarse_step: usize,
+    /// experiment
+    pub likelihood: u8,
+    /// experiment
+    pub cut: f64,
+    /// experiment
+    pub hit_fraction: f64,
+    /// experiment
+    pub like_sigma: f64,
 }
 
 impl Default for MatcherParameters {
@@ -116,6 +151,15 @@ impl Default for MatcherParameters {
             beam_skip: 0,
             minimum_score: 0.0,
             field_sigma: 0.06,
+            known: 240,
+            climb_levels: 2,
+            polish_steps: 5,
+            damping: 0.0,
+            coarse_step: 2,
+            likelihood: 0,
+            cut: 0.1,
+            hit_fraction: 0.9,
+            like_sigma: 0.1,
         }
     }
 }
@@ -138,11 +182,40 @@ pub struct Weighting {
     pub smoothing: WeightSmoothing,
     /// `resampleThreshold`: resample below this fraction of N effective particles.
     pub resample_threshold: f64,
+    /// experiment
+    pub proposal: f64,
+    /// experiment
+    pub prior: f64,
+    /// experiment
+    pub motion_scale: f64,
+    /// experiment
+    pub reference: f64,
+    /// experiment
+    pub per_beam: bool,
+}
+
+impl Weighting {
+    fn log_weight_gain(&self, particles: usize) -> f64 {
+        1.0 / (self.gain
+            * match self.smoothing {
+                WeightSmoothing::Fixed => self.reference,
+                WeightSmoothing::PerParticle => particles as f64,
+            })
+    }
 }
 
 impl Default for Weighting {
     fn default() -> Self {
-        Self { gain: 3.0, smoothing: WeightSmoothing::Fixed, resample_threshold: 0.5 }
+        Self {
+            gain: 3.0,
+            smoothing: WeightSmoothing::Fixed,
+            resample_threshold: 0.5,
+            proposal: 0.0,
+            prior: 0.0,
+            motion_scale: 1.0,
+            reference: 30.0,
+            per_beam: true,
+        }
     }
 }
 
@@ -231,46 +304,408 @@ pub enum Phase {
 #[derive(Debug)]
 pub struct GMapping {
     parameters: Parameters,
+    streams: Streams,
+    pool: Option<rayon::ThreadPool>,
+    matcher: FieldMatcher,
+    kernel: Kernel,
+    particles: Vec<Particle>,
+    tree: TrajectoryTree,
+    output: OutputMap,
+    odometry: Option<Pose2>,
+    since_processed: Motion,
+    last_processed: Option<Stamp>,
+    stamps: Vec<Stamp>,
+    scans_seen: usize,
 }
 
 impl GMapping {
     /// A filter with no scan yet. `threads` of 1 runs everything on the caller's thread.
     #[must_use]
-    pub fn new(parameters: Parameters, _seed: u64, _threads: usize) -> Self {
-        Self { parameters }
+    pub fn new(parameters: Parameters, seed: u64, threads: usize) -> Self {
+        let matcher = FieldMatcher::new(parameters.matcher, parameters.resolution);
+        let pool = (threads > 1).then(|| {
+            rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .thread_name(|i| format!("particles-{i}"))
+                .build()
+                .expect("threads can be started")
+        });
+        Self {
+            streams: Streams::new(seed),
+            pool,
+            matcher,
+            kernel: Kernel::new(
+                parameters.matcher.field_sigma / parameters.resolution,
+                parameters.matcher.known,
+            ),
+            particles: Vec::new(),
+            tree: TrajectoryTree::default(),
+            output: OutputMap::new(parameters.resolution),
+            odometry: None,
+            since_processed: Motion::default(),
+            last_processed: None,
+            stamps: Vec::new(),
+            scans_seen: 0,
+            parameters,
+        }
     }
 
     /// Takes an odometry reading between scans; returns whether the jump guard rejected its step.
-    pub fn add_odometry(&mut self, _odom_from_base: Pose2) -> bool {
+    pub fn add_odometry(&mut self, odom_from_base: Pose2) -> bool {
+        let Some(before) = self.odometry.replace(odom_from_base) else { return false };
+        let step = before.between(odom_from_base);
+        let jumped = step.position().norm() > self.parameters.jump.max_step;
+        if jumped && self.parameters.jump.policy == JumpPolicy::Reject {
+            return true;
+        }
+        self.since_processed.extend(step);
         false
     }
 
     /// Takes a scan; `on_phase` is called as each phase of processing ends.
     pub fn add_scan(
         &mut self,
-        _reading: &ScanReading<'_>,
-        _on_phase: &mut dyn FnMut(Phase),
+        reading: &ScanReading<'_>,
+        on_phase: &mut dyn FnMut(Phase),
     ) -> ScanUpdate {
-        let _ = &self.parameters;
-        ScanUpdate::Skipped(SkipReason::NoUsableBeams)
+        self.scans_seen += 1;
+        self.add_odometry(reading.odom_from_base);
+        if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans) {
+            return ScanUpdate::Skipped(SkipReason::Throttled);
+        }
+        let stamp = reading.scan.stamp;
+        let elapsed = self.last_processed.map(|last| stamp.seconds_since(last));
+        if !self.parameters.gate.opens(&self.since_processed, elapsed) {
+            return ScanUpdate::Skipped(SkipReason::NotMovedEnough);
+        }
+        let scan = PreparedScan::new(reading, &self.parameters);
+        if scan.points.all.is_empty() {
+            return ScanUpdate::Skipped(SkipReason::NoUsableBeams);
+        }
+        let motion = std::mem::take(&mut self.since_processed);
+        self.last_processed = Some(stamp);
+        self.stamps.push(stamp);
+        let report = if self.particles.is_empty() {
+            self.begin(reading.odom_from_base)
+        } else {
+            self.match_particles(&scan, &motion);
+            on_phase(Phase::Match);
+            self.resample()
+        };
+        on_phase(Phase::Resample);
+        self.register(&scan);
+        on_phase(Phase::Register);
+        let best = self.best().node;
+        self.output.add_scan(scan.outline);
+        self.output.follow(&mut self.tree, best);
+        if report.resampled {
+            let leaves = self.particles.iter().map(|p| p.node);
+            self.output.forget_scans_before(&self.tree, leaves);
+        }
+        on_phase(Phase::Map);
+        ScanUpdate::Processed(report)
+    }
+
+    fn begin(&mut self, odom_from_base: Pose2) -> ScanReport {
+        let pose = self.parameters.initial_pose.unwrap_or(odom_from_base);
+        let root = self.tree.append(None, pose);
+        (1..self.parameters.particles).for_each(|_| self.tree.hold(root));
+        self.particles = (0..self.parameters.particles)
+            .map(|_| Particle {
+                pose_in_map: pose,
+                log_weight: 0.0,
+                total_log_weight: 0.0,
+                node: root,
+                field: TileMap::new(),
+                covariance: Matrix3::zeros(),
+                matched: true,
+            })
+            .collect();
+        ScanReport {
+            effective_sample_size: self.parameters.particles as f64,
+            resampled: false,
+            matched: self.parameters.particles,
+        }
+    }
+
+    fn match_particles(&mut self, scan: &PreparedScan, motion: &Motion) {
+        let step = self.stamps.len() as u64;
+        let (matcher, streams) = (&self.matcher, &self.streams);
+        let noise = &self.parameters.motion_noise;
+        let weighting = self.parameters.weighting;
+        let [sx, sy, st] = noise.standard_deviations(motion);
+        for_each(self.pool.as_ref(), &mut self.particles, |i, particle| {
+            let ms = weighting.motion_scale;
+            let predicted = particle.pose_in_map * motion.increment;
+            let heading = particle.pose_in_map.theta;
+            let (sin, cos) = libm::sincos(heading);
+            let r = nalgebra::Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
+            let d = nalgebra::Vector3::new(
+                1.0 / (sx * sx + 1e-8),
+                1.0 / (sy * sy + 1e-8),
+                1.0 / (st * st + 1e-8),
+            );
+            let prior = if weighting.prior > 0.0 {
+                r * Matrix3::from_diagonal(&d) * r.transpose() * weighting.prior
+            } else {
+                Matrix3::zeros()
+            };
+            let start = if ms > 0.0 {
+                let mut gaussian = streams.gaussian(Purpose::Motion, step, i);
+                let scaled = Motion {
+                    forward: motion.forward * ms * ms,
+                    sideways: motion.sideways * ms * ms,
+                    turned: motion.turned * ms * ms,
+                    ..*motion
+                };
+                particle.pose_in_map * motion_model::sample(&scaled, noise, &mut gaussian)
+            } else {
+                predicted
+            };
+            let found = matcher.run(&particle.field, &scan.points, start, &prior);
+            let mut pose = found.pose_in_map;
+            if weighting.proposal > 0.0 {
+                let mut g = streams.gaussian(Purpose::Proposal, step, i);
+                if let Some(c) = found.covariance.cholesky() {
+                    let v = c.l()
+                        * nalgebra::Vector3::new(g.draw(), g.draw(), g.draw())
+                        * weighting.proposal;
+                    pose = Pose2::new(
+                        pose.x + v[0],
+                        pose.y + v[1],
+                        pose::wrap_angle(pose.theta + v[2]),
+                    );
+                }
+            }
+            particle.pose_in_map = pose;
+            particle.covariance = found.covariance;
+            particle.matched = found.accepted;
+            let beams = if weighting.per_beam { 180.0 / scan.points.all.len() as f64 } else { 1.0 };
+            particle.log_weight += found.log_likelihood * beams;
+            particle.total_log_weight += found.log_likelihood * beams;
+        });
+    }
+
+    fn resample(&mut self) -> ScanReport {
+        let n = self.particles.len();
+        let log_weights: Vec<f64> = self.particles.iter().map(|p| p.log_weight).collect();
+        let weights =
+            resampling::normalize(&log_weights, self.parameters.weighting.log_weight_gain(n));
+        let effective_sample_size = resampling::effective_sample_size(&weights);
+        let resampled =
+            effective_sample_size < self.parameters.weighting.resample_threshold * n as f64;
+        let before: Vec<NodeId> = self.particles.iter().map(|p| p.node).collect();
+        if resampled {
+            let uniform = self.streams.uniform(Purpose::Resampling, self.stamps.len() as u64, 0);
+            let ancestors = resampling::systematic(&weights, uniform);
+            self.particles = ancestors
+                .into_iter()
+                .map(|ancestor| Particle { log_weight: 0.0, ..self.particles[ancestor].clone() })
+                .collect();
+        }
+        for particle in &mut self.particles {
+            particle.node = self.tree.append(Some(particle.node), particle.pose_in_map);
+        }
+        before.into_iter().for_each(|node| self.tree.release(node));
+        let matched = self.particles.iter().filter(|p| p.matched).count();
+        ScanReport { effective_sample_size, resampled, matched }
+    }
+
+    fn register(&mut self, scan: &PreparedScan) {
+        let (kernel, resolution) = (&self.kernel, self.parameters.resolution);
+        for_each(self.pool.as_ref(), &mut self.particles, |_, particle| {
+            let pose = particle.pose_in_map;
+            let origin = Cell::containing(pose.position(), resolution);
+            let x = pose.x / resolution - f64::from(origin.ix);
+            let y = pose.y / resolution - f64::from(origin.iy);
+            let (sin, cos) = libm::sincos(pose.theta);
+            for (px, py) in scan.points.all.iter() {
+                let (px, py) = (f64::from(px), f64::from(py));
+                kernel.stamp(
+                    &mut particle.field,
+                    origin,
+                    x + cos * px - sin * py,
+                    y + sin * px + cos * py,
+                );
+            }
+        });
+    }
+
+    fn best(&self) -> &Particle {
+        let mut particles = self.particles.iter();
+        let first = particles.next().expect("there is at least one particle");
+        particles.fold(
+            first,
+            |best, p| if p.total_log_weight > best.total_log_weight { p } else { best },
+        )
+    }
+
+    /// Particles.
+    pub fn particles(&self) -> &[Particle] {
+        &self.particles
+    }
+
+    /// Tiles of the particles' fields.
+    pub fn tile_counts(&self) -> super::grid::tile_map::TileCounts {
+        super::grid::tile_map::TileCounts::of(self.particles.iter().map(|p| &p.field))
     }
 
     /// The best particle's pose of the base in `map` at its last processed scan, with odometry since.
     #[must_use]
     pub fn pose_in_map(&self) -> Pose2 {
-        Pose2::IDENTITY
+        self.best().pose_in_map * self.since_processed.increment
     }
 
     /// The pose of each processed scan as the best particle sees it now, oldest first.
     #[must_use]
     pub fn path(&self) -> Vec<(Stamp, Pose2)> {
-        Vec::new()
+        if self.particles.is_empty() {
+            return Vec::new();
+        }
+        let mut poses: Vec<Pose2> =
+            self.tree.ancestry(self.best().node).map(|n| self.tree.pose(n)).collect();
+        poses.reverse();
+        self.stamps.iter().copied().zip(poses).collect()
     }
 
     /// The map of the best particle, cropped to what is known; `None` before the first scan.
     #[must_use]
     pub fn occupancy_grid(&self) -> Option<OccupancyGrid> {
-        None
+        self.output.map.to_grid(self.parameters.map.occupied_threshold)
+    }
+}
+
+/// Runs `work` on each particle with its number, in parallel if there is a pool.
+fn for_each(
+    pool: Option<&rayon::ThreadPool>,
+    particles: &mut [Particle],
+    work: impl Fn(usize, &mut Particle) + Sync,
+) {
+    use rayon::prelude::*;
+    match pool {
+        Some(pool) => pool.install(|| {
+            particles.par_iter_mut().with_min_len(4).enumerate().for_each(|(i, p)| work(i, p));
+        }),
+        None => particles.iter_mut().enumerate().for_each(|(i, p)| work(i, p)),
+    }
+}
+
+/// One hypothesis.
+#[derive(Debug, Clone)]
+pub struct Particle {
+    /// The base at the last processed scan.
+    pub pose_in_map: Pose2,
+    /// Since the last resampling.
+    log_weight: f64,
+    total_log_weight: f64,
+    node: NodeId,
+    field: TileMap<u8>,
+    /// Of the last match.
+    pub covariance: Matrix3<f64>,
+    matched: bool,
+}
+
+/// A scan made ready.
+#[derive(Debug)]
+struct PreparedScan {
+    points: MatchPoints,
+    outline: ScanOutline,
+}
+
+impl PreparedScan {
+    fn new(reading: &ScanReading<'_>, parameters: &Parameters) -> Self {
+        let geometry = &reading.scan.geometry;
+        let limit = 16_000.0 * parameters.resolution;
+        let max_range = parameters.max_range.unwrap_or(f64::INFINITY);
+        let usable =
+            parameters.max_usable_range.unwrap_or(geometry.range_max()).min(max_range).min(limit);
+        let mut hits = Vec::new();
+        let mut ends = Vec::new();
+        for (i, range) in reading.scan.ranges.iter().enumerate() {
+            let angle = geometry.angle(i);
+            let (range, kind) = match geometry.classify(*range) {
+                Beam::Hit(range) if range <= usable => (range, BeamEndKind::Hit),
+                Beam::Hit(range) if range <= max_range => (usable, BeamEndKind::Free),
+                Beam::NoReturn if parameters.map.free_on_no_return => (usable, BeamEndKind::Free),
+                _ => (0.0, BeamEndKind::Nothing),
+            };
+            let point = reading.mount.point_in_base(angle, range);
+            if kind == BeamEndKind::Hit {
+                hits.push((
+                    (point.x / parameters.resolution) as f32,
+                    (point.y / parameters.resolution) as f32,
+                ));
+            }
+            ends.push(BeamEnd { point: [point.x as f32, point.y as f32], kind });
+        }
+        let all: Points = hits.into_iter().step_by(parameters.matcher.beam_skip + 1).collect();
+        let coarse = all.every(parameters.matcher.coarse_step);
+        let radius = all.iter().map(|(x, y)| x.hypot(y)).fold(0.0, f32::max) as i32 + 1;
+        let sensor = reading.mount.base_from_laser.position();
+        Self {
+            points: MatchPoints { all, coarse, radius },
+            outline: ScanOutline {
+                sensor,
+                ends,
+                angle_increment: geometry.angle_increment().abs(),
+            },
+        }
+    }
+}
+
+/// The occupancy map of one trajectory, moved from trajectory to trajectory by what differs.
+#[derive(Debug)]
+struct OutputMap {
+    map: OccupancyMap,
+    node: Option<NodeId>,
+    /// Scans that living particles may place differently; the first has number `first_scan`.
+    scans: VecDeque<ScanOutline>,
+    first_scan: u32,
+}
+
+impl OutputMap {
+    fn new(resolution: f64) -> Self {
+        Self {
+            map: OccupancyMap::new(resolution),
+            node: None,
+            scans: VecDeque::new(),
+            first_scan: 0,
+        }
+    }
+
+    fn add_scan(&mut self, scan: ScanOutline) {
+        self.scans.push_back(scan);
+    }
+
+    fn follow(&mut self, tree: &mut TrajectoryTree, node: NodeId) {
+        let shared = self.node.and_then(|old| tree.common_ancestor(old, node));
+        if let Some(old) = self.node {
+            for id in tree.ancestry(old).take_while(|id| Some(*id) != shared) {
+                let scan = &self.scans[(tree.depth(id) - self.first_scan) as usize];
+                self.map.remove(scan, tree.pose(id));
+            }
+        }
+        for id in tree.ancestry(node).take_while(|id| Some(*id) != shared) {
+            let scan = &self.scans[(tree.depth(id) - self.first_scan) as usize];
+            self.map.add(scan, tree.pose(id));
+        }
+        tree.hold(node);
+        if let Some(old) = self.node.replace(node) {
+            tree.release(old);
+        }
+    }
+
+    fn forget_scans_before(&mut self, tree: &TrajectoryTree, leaves: impl Iterator<Item = NodeId>) {
+        let mut shared = self.node;
+        for leaf in leaves {
+            shared = shared.and_then(|shared| tree.common_ancestor(shared, leaf));
+        }
+        if let Some(shared) = shared {
+            while self.first_scan <= tree.depth(shared) {
+                self.scans.pop_front();
+                self.first_scan += 1;
+            }
+        }
     }
 }
 

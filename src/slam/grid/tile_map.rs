@@ -1,0 +1,239 @@
+//! A grid without bounds that is cheap to copy: tiles behind reference counts, copied when written.
+//!
+//! Tiles are gathered in pages, so that a clone of the map copies one short list of pages and a
+//! write copies at most one page of pointers and one tile.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use super::Cell;
+
+/// Cells along the side of a tile.
+pub const TILE_SIZE: usize = 32;
+/// Cells in a tile.
+pub const TILE_CELLS: usize = TILE_SIZE * TILE_SIZE;
+const TILE_SHIFT: u32 = TILE_SIZE.trailing_zeros();
+const PAGE_SIZE: usize = 8;
+const PAGE_SHIFT: u32 = PAGE_SIZE.trailing_zeros();
+
+/// The cells of a tile, row by row.
+pub type Tile<C> = [C; TILE_CELLS];
+
+/// Which tile: cell coordinates divided by [`TILE_SIZE`], rounded down; rows order first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TileKey {
+    /// Row of tiles.
+    pub ty: i32,
+    /// Column of tiles.
+    pub tx: i32,
+}
+
+impl TileKey {
+    /// The tile that holds `cell`.
+    #[must_use]
+    pub const fn containing(cell: Cell) -> Self {
+        Self { ty: cell.iy >> TILE_SHIFT, tx: cell.ix >> TILE_SHIFT }
+    }
+
+    /// The lower-left cell of the tile.
+    #[must_use]
+    pub const fn first_cell(self) -> Cell {
+        Cell::new(self.tx << TILE_SHIFT, self.ty << TILE_SHIFT)
+    }
+
+    const fn page(self) -> Self {
+        Self { ty: self.ty >> PAGE_SHIFT, tx: self.tx >> PAGE_SHIFT }
+    }
+
+    const fn slot(self) -> usize {
+        let mask = PAGE_SIZE as i32 - 1;
+        (self.ty & mask) as usize * PAGE_SIZE + (self.tx & mask) as usize
+    }
+}
+
+/// Index of `cell` within its tile.
+#[must_use]
+pub const fn index_in_tile(cell: Cell) -> usize {
+    let mask = TILE_SIZE as i32 - 1;
+    (cell.iy & mask) as usize * TILE_SIZE + (cell.ix & mask) as usize
+}
+
+#[derive(Debug, Clone)]
+struct Page<C> {
+    tiles: [Option<Arc<Tile<C>>>; PAGE_SIZE * PAGE_SIZE],
+}
+
+impl<C> Page<C> {
+    fn tiles(&self, page: TileKey) -> impl Iterator<Item = (TileKey, &Tile<C>)> {
+        self.tiles.iter().enumerate().filter_map(move |(slot, tile)| {
+            let key = TileKey {
+                ty: (page.ty << PAGE_SHIFT) + (slot / PAGE_SIZE) as i32,
+                tx: (page.tx << PAGE_SHIFT) + (slot % PAGE_SIZE) as i32,
+            };
+            Some((key, &**tile.as_ref()?))
+        })
+    }
+}
+
+/// Cells of type `C` over the whole plane; a cell never written holds `C::default()`.
+///
+/// A clone shares every tile with its original until one of the two writes to it.
+#[derive(Debug, Clone, Default)]
+pub struct TileMap<C> {
+    /// Ordered by key.
+    pages: Vec<(TileKey, Arc<Page<C>>)>,
+}
+
+impl<C: Copy + Default> TileMap<C> {
+    /// A map in which every cell holds the default.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { pages: Vec::new() }
+    }
+
+    /// The value of one cell.
+    #[must_use]
+    pub fn get(&self, cell: Cell) -> C {
+        self.tile(TileKey::containing(cell))
+            .map_or_else(C::default, |tile| tile[index_in_tile(cell)])
+    }
+
+    /// A tile, if a cell of it was ever written.
+    #[must_use]
+    pub fn tile(&self, key: TileKey) -> Option<&Tile<C>> {
+        let found = self.pages.binary_search_by_key(&key.page(), |(page, _)| *page).ok()?;
+        self.pages[found].1.tiles[key.slot()].as_deref()
+    }
+
+    /// A tile to write to: created if missing, copied if shared.
+    pub fn tile_mut(&mut self, key: TileKey) -> &mut Tile<C> {
+        let page_key = key.page();
+        let index = match self.pages.binary_search_by_key(&page_key, |(page, _)| *page) {
+            Ok(index) => index,
+            Err(index) => {
+                let empty = Page { tiles: [const { None }; PAGE_SIZE * PAGE_SIZE] };
+                self.pages.insert(index, (page_key, Arc::new(empty)));
+                index
+            }
+        };
+        let page = Arc::make_mut(&mut self.pages[index].1);
+        let tile =
+            page.tiles[key.slot()].get_or_insert_with(|| Arc::new([C::default(); TILE_CELLS]));
+        Arc::make_mut(tile)
+    }
+
+    /// A cell to write to.
+    pub fn get_mut(&mut self, cell: Cell) -> &mut C {
+        &mut self.tile_mut(TileKey::containing(cell))[index_in_tile(cell)]
+    }
+
+    /// The written tiles in the rectangle from `first` to `last`, both included.
+    pub fn tiles_between(
+        &self,
+        first: TileKey,
+        last: TileKey,
+    ) -> impl Iterator<Item = (TileKey, &Tile<C>)> {
+        let (first_page, last_page) = (first.page(), last.page());
+        let start = self.pages.partition_point(|(page, _)| page.ty < first_page.ty);
+        self.pages[start..]
+            .iter()
+            .take_while(move |(page, _)| page.ty <= last_page.ty)
+            .filter(move |(page, _)| (first_page.tx..=last_page.tx).contains(&page.tx))
+            .flat_map(|(key, page)| page.tiles(*key))
+            .filter(move |(key, _)| {
+                (first.tx..=last.tx).contains(&key.tx) && (first.ty..=last.ty).contains(&key.ty)
+            })
+    }
+
+    /// Every written tile, page by page.
+    pub fn tiles(&self) -> impl Iterator<Item = (TileKey, &Tile<C>)> {
+        self.pages.iter().flat_map(|(key, page)| page.tiles(*key))
+    }
+}
+
+/// How many tiles some maps refer to, and how many there are when shared ones count once.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct TileCounts {
+    /// References to tiles, summed over the maps.
+    pub referenced: usize,
+    /// Tiles in memory.
+    pub distinct: usize,
+    /// Bytes of the tiles in memory.
+    pub bytes: usize,
+}
+
+impl TileCounts {
+    /// Counts the tiles of `maps`.
+    #[must_use]
+    pub fn of<'a, C: Copy + Default + 'a>(maps: impl Iterator<Item = &'a TileMap<C>>) -> Self {
+        let mut distinct = HashSet::new();
+        let mut referenced = 0;
+        for (_, tile) in maps.flat_map(TileMap::tiles) {
+            referenced += 1;
+            distinct.insert(std::ptr::from_ref(tile));
+        }
+        let bytes = distinct.len() * size_of::<Tile<C>>();
+        Self { referenced, distinct: distinct.len(), bytes }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::{prop_assert_eq, proptest};
+
+    use super::*;
+
+    const SPREAD: std::ops::Range<i32> = -600..600;
+
+    proptest! {
+        #[test]
+        fn copy_on_write_equals_deep_copies(
+            before in proptest::collection::vec((SPREAD, SPREAD, 1_u8..), 0..40),
+            after in proptest::collection::vec((SPREAD, SPREAD, 1_u8.., 0..2_usize), 0..40),
+        ) {
+            let mut shared = [TileMap::new(), TileMap::new()];
+            let mut deep = [std::collections::HashMap::new(), std::collections::HashMap::new()];
+            for (ix, iy, value) in before {
+                *shared[0].get_mut(Cell::new(ix, iy)) = value;
+                deep[0].insert((ix, iy), value);
+            }
+            shared[1] = shared[0].clone();
+            deep[1] = deep[0].clone();
+            for (ix, iy, value, which) in after {
+                *shared[which].get_mut(Cell::new(ix, iy)) = value;
+                deep[which].insert((ix, iy), value);
+            }
+            for (map, expected) in shared.iter().zip(&deep) {
+                let written = map.tiles().flat_map(|(_, tile)| tile).filter(|v| **v != 0).count();
+                prop_assert_eq!(written, expected.len());
+                for ((ix, iy), value) in expected {
+                    prop_assert_eq!(map.get(Cell::new(*ix, *iy)), *value);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn only_the_written_tile_is_copied() {
+        let mut a = TileMap::<u8>::new();
+        *a.get_mut(Cell::new(0, 0)) = 1;
+        *a.get_mut(Cell::new(-1, 0)) = 2;
+        let mut b = a.clone();
+        *b.get_mut(Cell::new(5, 5)) = 3;
+        let counts = TileCounts::of([&a, &b].into_iter());
+        assert_eq!((counts.referenced, counts.distinct), (4, 3));
+        assert_eq!(a.get(Cell::new(5, 5)), 0);
+    }
+
+    #[test]
+    fn tiles_know_where_they_are() {
+        let mut map = TileMap::<u8>::new();
+        for cell in [Cell::new(-1, -33), Cell::new(1000, 7), Cell::new(i32::MAX, i32::MIN)] {
+            *map.get_mut(cell) = 9;
+            let key = TileKey::containing(cell);
+            assert!(
+                map.tiles().any(|(found, tile)| found == key && tile[index_in_tile(cell)] == 9)
+            );
+        }
+    }
+}
