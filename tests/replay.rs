@@ -165,6 +165,19 @@ fn malformed_lines_are_told_with_number_and_reason_and_passed_over() {
     assert_eq!(summary["readings"]["total"], 17);
 }
 
+/// B5 of the semantics: a jump of more than `jump_max_step_m`, there and back.
+#[test]
+fn jumps_of_odometry_are_rejected_and_counted() {
+    let directory = directory();
+    let mut lines: Vec<String> = room_log().lines().map(str::to_owned).collect();
+    lines.insert(10, "ODOM 30 0 0 0 0 0 104.1 host 0".to_owned());
+    let log = file(&directory, "jump.log", lines.join("\n").as_bytes());
+    let rejected = summary(&[text(&log)]);
+    assert_eq!(rejected["readings"]["jump_rejected"], 2);
+    let believed = summary(&[text(&log), "--set", "jump_policy=continue"]);
+    assert_eq!(believed["readings"]["jump_rejected"], 0);
+}
+
 #[test]
 fn a_truncated_log_is_replayed_up_to_where_it_ends() {
     let directory = directory();
