@@ -1,0 +1,40 @@
+//! The subcommands: one file each.
+
+mod evaluate;
+mod progress;
+mod replay;
+
+use clap::{Parser, Subcommand};
+
+/// 2D laser mapping for robots on a Zenoh mesh.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    after_help = "Examples:\n  \
+        gmapd replay run.log --out out                 map a recorded run\n  \
+        gmapd replay run.log --set particles=60        with more particles\n  \
+        gmapd evaluate out/trajectory.tum run.relations\n\n\
+        Exit codes: 0 done, 1 failed, 2 wrong usage."
+)]
+pub(crate) struct Arguments {
+    /// What to do.
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Map a recorded run
+    Replay(replay::Arguments),
+    /// Compare a trajectory with known relations between its poses
+    Evaluate(evaluate::Arguments),
+}
+
+/// Runs a subcommand to its end.
+pub(crate) fn run(command: Command) -> anyhow::Result<()> {
+    match command {
+        Command::Replay(arguments) => replay::run(&arguments),
+        Command::Evaluate(arguments) => evaluate::run(&arguments),
+    }
+}

@@ -1,0 +1,251 @@
+//! `gmapd replay`: a recorded run to a map, a trajectory and figures.
+
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::Args;
+use gmapd::clock::Stopwatch;
+use gmapd::config::Config;
+use gmapd::evaluation::tum;
+use gmapd::files::write_atomically;
+use gmapd::logs::LogStatistics;
+use gmapd::logs::carmen::CarmenLog;
+use gmapd::map;
+use gmapd::replay::{Hashes, Outcome, PhaseTimes, Replay, Run, Summary};
+use gmapd::slam::pose::Point2;
+use sha2::{Digest as _, Sha256};
+
+use super::progress::Progress;
+
+/// Malformed lines that are told one by one.
+const MALFORMED_SHOWN: usize = 10;
+
+/// What to replay, and how.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+    The log is in CARMEN's format, plain or gzipped: FLASER, ROBOTLASER1, ODOM and PARAM lines\n\
+    are used, others are counted. It is replayed in file order, as fast as it goes.\n\
+    The same log, configuration and seed give the same map on any number of threads.\n\n\
+    With --out DIR: map.pgm and map.yaml (nav2's map_server loads them), map.png (to look at),\n\
+    trajectory.tum (evo opens it) and summary.json. Without, only the summary is printed.\n\n\
+    Examples:\n  \
+        gmapd replay intel.log --out out\n  \
+        gmapd replay intel.log.gz --config config/gmapd.yaml --set maxUrange=40 --out out\n  \
+        gmapd replay intel.log --set particles=30 --set delta=0.1 --seed 7 --json")]
+pub(crate) struct Arguments {
+    /// Recorded log
+    log: PathBuf,
+    /// Configuration, or a parameter file of slam_gmapping; slam_gmapping's defaults without
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Directory for the results; made if it is not there
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Set a key of the configuration; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Seed of the random numbers; the same as --set seed=N
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Threads of the filter; the result is the same for any number
+    #[arg(long, value_name = "N", default_value = "1")]
+    threads: NonZeroUsize,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let config = load_config(arguments)?;
+    let log = CarmenLog::open(&arguments.log)?;
+    warn_about(log.statistics(), &arguments.log);
+    if let Some(directory) = &arguments.out {
+        std::fs::create_dir_all(directory)
+            .with_context(|| format!("cannot make the directory {}", directory.display()))?;
+    }
+    let threads = arguments.threads.get();
+    let watch = Stopwatch::start();
+    let outcome = replay(&log, Replay::new(&config, threads))?;
+    let elapsed = watch.elapsed();
+
+    let products = Products::of(&outcome);
+    let mut written = match &arguments.out {
+        Some(directory) => products.write(directory, &outcome)?,
+        None => Vec::new(),
+    };
+    // Last, so that the peak of memory is that of the whole run.
+    let run = Run { config: &config, threads, log: log.statistics(), elapsed };
+    let summary = Summary::new(&run, &outcome, products.hashes());
+    if let Some(directory) = &arguments.out {
+        let path = directory.join("summary.json");
+        write_atomically(&path, json(&summary)?.as_bytes())?;
+        written.push(path);
+    }
+    let text = if arguments.json { json(&summary)? } else { readable(&summary, &written) };
+    std::io::stdout().lock().write_all(text.as_bytes()).context("cannot print the summary")
+}
+
+fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
+    let mut overrides = arguments.set.clone();
+    overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
+    let config = Config::load(arguments.config.as_deref(), &overrides)?;
+    for warning in &config.warnings {
+        eprintln!("warning: {warning}");
+    }
+    if cfg!(debug_assertions) {
+        eprintln!("warning: this is a debug build, many times slower than a release build");
+    }
+    Ok(config)
+}
+
+fn warn_about(log: &LogStatistics, path: &Path) {
+    for malformed in log.first_malformed.iter().take(MALFORMED_SHOWN) {
+        eprintln!("warning: {}:{}: {}", path.display(), malformed.line, malformed.reason);
+    }
+    if log.malformed > MALFORMED_SHOWN as u64 {
+        eprintln!("warning: {} malformed lines in all", log.malformed);
+    }
+}
+
+fn replay(log: &CarmenLog, mut replay: Replay) -> anyhow::Result<Outcome> {
+    let mut progress = Progress::new(log.statistics());
+    for reading in log.readings()? {
+        let reading = reading?;
+        replay.add(&reading);
+        progress.advance(reading.stamp);
+    }
+    progress.finish();
+    Ok(replay.finish())
+}
+
+/// What is hashed even when it is not written.
+struct Products {
+    /// `map.pgm`; none when no scan was processed.
+    map: Option<Vec<u8>>,
+    /// `trajectory.tum`.
+    trajectory: Vec<u8>,
+}
+
+impl Products {
+    fn of(outcome: &Outcome) -> Self {
+        Self {
+            map: outcome.map.as_ref().map(map::pgm),
+            trajectory: tum(&outcome.trajectory).into_bytes(),
+        }
+    }
+
+    fn hashes(&self) -> Hashes {
+        Hashes { map: self.map.as_deref().map(sha256), trajectory: sha256(&self.trajectory) }
+    }
+
+    fn write(&self, directory: &Path, outcome: &Outcome) -> anyhow::Result<Vec<PathBuf>> {
+        let mut written = Vec::new();
+        let mut write = |name: &str, bytes: &[u8]| {
+            let path = directory.join(name);
+            write_atomically(&path, bytes)?;
+            written.push(path);
+            anyhow::Ok(())
+        };
+        match (&self.map, &outcome.map) {
+            (Some(pgm), Some(grid)) => {
+                let path: Vec<Point2> =
+                    outcome.trajectory.iter().map(|reading| reading.pose.position()).collect();
+                write("map.pgm", pgm)?;
+                write("map.yaml", map::yaml(grid, "map.pgm").as_bytes())?;
+                write("map.png", &map::png(grid, &path).context("cannot draw map.png")?)?;
+            }
+            _ => eprintln!("warning: no scan was processed, so no map is written"),
+        }
+        write("trajectory.tum", &self.trajectory)?;
+        Ok(written)
+    }
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn json(summary: &Summary) -> anyhow::Result<String> {
+    Ok(serde_json::to_string_pretty(summary)? + "\n")
+}
+
+fn readable(summary: &Summary, written: &[PathBuf]) -> String {
+    let mut text = String::new();
+    let mut line = |name: &str, value: String| {
+        writeln!(text, "{name:<14} {value}").ok();
+    };
+    line("readings", readings(summary));
+    line("particles", particles(summary));
+    let timing = &summary.timing;
+    line(
+        "time",
+        format!(
+            "{:.1} s for {:.0} s of log: {:.0} times real time (CPU {:.1} s, {} threads)",
+            timing.wall_s, timing.log_s, timing.real_time_factor, timing.cpu_s, summary.threads
+        ),
+    );
+    if let Some(times) = &timing.scan {
+        line("ms a scan", milliseconds(times));
+    }
+    if let Some(phases) = &timing.phases {
+        line("  match", milliseconds(&phases.matching));
+        line("  resample", milliseconds(&phases.resample));
+        line("  register", milliseconds(&phases.register));
+        line("  map", milliseconds(&phases.map));
+    }
+    if let Some(bytes) = timing.peak_memory_bytes {
+        line("peak memory", format!("{:.1} MB", bytes as f64 / 1e6));
+    }
+    let tiles = &summary.tiles;
+    line(
+        "tiles",
+        format!(
+            "{} in {:.1} MB, shared by {:.1} particles on average",
+            tiles.distinct,
+            tiles.bytes as f64 / 1e6,
+            tiles.referenced as f64 / tiles.distinct.max(1) as f64
+        ),
+    );
+    line("map SHA-256", summary.sha256.map.clone().unwrap_or_else(|| "no map".to_owned()));
+    line("trajectory", summary.sha256.trajectory.clone());
+    for path in written {
+        line("wrote", path.display().to_string());
+    }
+    text
+}
+
+fn readings(summary: &Summary) -> String {
+    let counts = &summary.readings;
+    let rare = [
+        (counts.not_moved_enough, "not moved enough"),
+        (counts.throttled, "throttled"),
+        (counts.no_usable_beams, "without usable beams"),
+        (counts.bad_odometry, "with bad odometry"),
+        (counts.odometry_only, "odometry only"),
+        (counts.jump_rejected, "jumps rejected"),
+        (counts.malformed, "malformed lines"),
+    ];
+    let mut text = format!("{}: {} processed", counts.total, counts.processed);
+    for (count, name) in rare.into_iter().filter(|(count, _)| *count > 0) {
+        write!(text, ", {count} {name}").ok();
+    }
+    text
+}
+
+fn particles(summary: &Summary) -> String {
+    let sizes = summary.effective_sample_size.map_or_else(String::new, |sizes| {
+        format!(", effective {:.1} on average, {:.1} at least", sizes.mean, sizes.min)
+    });
+    format!("{}, resampled {} times{sizes}", summary.particles, summary.resamples)
+}
+
+fn milliseconds(times: &PhaseTimes) -> String {
+    let cpu = times.cpu_ms;
+    format!(
+        "CPU mean {:.3}  p50 {:.3}  p99 {:.3}  max {:.3}; wall mean {:.3}",
+        cpu.mean, cpu.p50, cpu.p99, cpu.max, times.wall_ms.mean
+    )
+}

@@ -1,0 +1,242 @@
+//! The configuration file: every key with its default, as slam_gmapping names it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::gmapping::Parameters;
+
+/// All keys of the file. A key that is left out has slam_gmapping's default.
+///
+/// Keys of slam_gmapping keep their names, so that its parameter files load as they are.
+/// Keys of our own carry their unit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RawConfig {
+    /// Number of hypotheses.
+    pub particles: usize,
+    /// Every n-th scan is looked at.
+    pub throttle_scans: usize,
+
+    /// Frame of the robot.
+    pub base_frame: String,
+    /// Frame of the map.
+    pub map_frame: String,
+    /// Frame of odometry.
+    pub odom_frame: String,
+    /// Seconds between two maps that are handed out, by the stamps of scans.
+    pub map_update_interval: f64,
+    /// Seconds between two sendings of `map` to `odom`; 0 is off.
+    pub transform_publish_period: f64,
+    /// Seconds by which `map` to `odom` is dated ahead; left out, `transform_publish_period`.
+    pub tf_delay: Option<f64>,
+
+    /// Readings strictly above are discarded, m; left out, the sensor's own limit.
+    #[serde(rename = "maxRange")]
+    pub max_range: Option<f64>,
+    /// Readings above are not matched and free space ends there, m; left out, `maxRange`.
+    #[serde(rename = "maxUrange")]
+    pub max_usable_range: Option<f64>,
+    /// Beams passed over between two that are matched.
+    #[serde(rename = "lskip")]
+    pub beam_skip: usize,
+
+    /// Translation noise per metre travelled, m/m.
+    #[serde(rename = "srr")]
+    pub translation_noise_from_translation: f64,
+    /// Rotation noise per metre travelled, rad/m.
+    #[serde(rename = "srt")]
+    pub rotation_noise_from_translation: f64,
+    /// Translation noise per radian turned, m/rad.
+    #[serde(rename = "str")]
+    pub translation_noise_from_rotation: f64,
+    /// Rotation noise per radian turned, rad/rad.
+    #[serde(rename = "stt")]
+    pub rotation_noise_from_rotation: f64,
+
+    /// Metres travelled after which a scan is processed.
+    #[serde(rename = "linearUpdate")]
+    pub linear_update: f64,
+    /// Radians turned after which a scan is processed.
+    #[serde(rename = "angularUpdate")]
+    pub angular_update: f64,
+    /// Seconds after which a scan is processed; negative is off.
+    #[serde(rename = "temporalUpdate")]
+    pub temporal_update: f64,
+
+    /// Which scan matcher runs.
+    pub matcher: Matcher,
+    /// First step of the hill climb, m.
+    #[serde(rename = "lstep")]
+    pub linear_step: f64,
+    /// First step of the hill climb, rad.
+    #[serde(rename = "astep")]
+    pub angular_step: f64,
+    /// A match counts only above this score.
+    #[serde(rename = "minimumScore")]
+    pub minimum_score: f64,
+    /// Standard deviation of the likelihood field around a hit, m.
+    pub field_sigma_m: f64,
+    /// Compat matcher: a beam scores exp(-d²/sigma), m².
+    pub sigma: f64,
+    /// Compat matcher: cells searched around an endpoint.
+    #[serde(rename = "kernelSize")]
+    pub kernel_size: u32,
+    /// Compat matcher: a beam's log likelihood is -d²/lsigma, m².
+    #[serde(rename = "lsigma")]
+    pub likelihood_sigma: f64,
+    /// Compat matcher: how often the steps are halved.
+    pub iterations: u32,
+
+    /// Flattens weights.
+    #[serde(rename = "ogain")]
+    pub gain: f64,
+    /// Whether weights are flattened with the number of particles.
+    pub weight_smoothing: Smoothing,
+    /// Resample below this fraction of effective particles.
+    #[serde(rename = "resampleThreshold")]
+    pub resample_threshold: f64,
+    /// Seed of all random numbers.
+    pub seed: u64,
+
+    /// Metres between two odometry readings that count as a jump.
+    pub jump_max_step_m: f64,
+    /// What happens at a jump.
+    pub jump_policy: Jump,
+    /// Pose of the base in `map` at the first scan: m, m, rad; left out, odometry's.
+    pub initial_pose: Option<[f64; 3]>,
+    /// How the laser sits on the robot; left out, what the log or the transforms say.
+    pub laser: Option<Laser>,
+
+    /// Metres a cell.
+    #[serde(rename = "delta")]
+    pub resolution: f64,
+    /// A cell is occupied when hits / visits is above this.
+    #[serde(rename = "occ_thresh")]
+    pub occupied_threshold: f64,
+    /// Whether a beam without return marks free space out to `maxUrange`.
+    pub free_on_no_return: bool,
+
+    /// Without effect: the map grows without limit.
+    pub xmin: f64,
+    /// Without effect: the map grows without limit.
+    pub ymin: f64,
+    /// Without effect: the map grows without limit.
+    pub xmax: f64,
+    /// Without effect: the map grows without limit.
+    pub ymax: f64,
+    /// Never had an effect.
+    pub llsamplerange: f64,
+    /// Never had an effect.
+    pub llsamplestep: f64,
+    /// Never had an effect.
+    pub lasamplerange: f64,
+    /// Never had an effect.
+    pub lasamplestep: f64,
+}
+
+/// Keys whose values slam_gmapping reads and never uses.
+pub(super) const DEAD_KEYS: [&str; 4] =
+    ["llsamplerange", "llsamplestep", "lasamplerange", "lasamplestep"];
+
+/// Keys that size the original's first map.
+pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
+
+/// Keys that only the compat matcher looks at.
+pub(super) const COMPAT_KEYS: [&str; 4] = ["sigma", "kernelSize", "lsigma", "iterations"];
+
+impl Default for RawConfig {
+    fn default() -> Self {
+        let core = Parameters::default();
+        Self {
+            particles: core.particles,
+            throttle_scans: core.throttle_scans,
+            base_frame: "base_link".to_owned(),
+            map_frame: "map".to_owned(),
+            odom_frame: "odom".to_owned(),
+            map_update_interval: 5.0,
+            transform_publish_period: 0.05,
+            tf_delay: None,
+            max_range: core.max_range,
+            max_usable_range: core.max_usable_range,
+            beam_skip: core.matcher.beam_skip,
+            translation_noise_from_translation: core.motion_noise.translation_from_translation,
+            rotation_noise_from_translation: core.motion_noise.rotation_from_translation,
+            translation_noise_from_rotation: core.motion_noise.translation_from_rotation,
+            rotation_noise_from_rotation: core.motion_noise.rotation_from_rotation,
+            linear_update: core.gate.linear_update,
+            angular_update: core.gate.angular_update,
+            temporal_update: core.gate.temporal_update.unwrap_or(-1.0),
+            matcher: Matcher::Field,
+            linear_step: core.matcher.linear_step,
+            angular_step: core.matcher.angular_step,
+            minimum_score: core.matcher.minimum_score,
+            field_sigma_m: core.matcher.field_sigma,
+            sigma: core.matcher.sigma,
+            kernel_size: core.matcher.kernel_size,
+            likelihood_sigma: core.matcher.likelihood_sigma,
+            iterations: core.matcher.iterations,
+            gain: core.weighting.gain,
+            weight_smoothing: Smoothing::Fixed,
+            resample_threshold: core.weighting.resample_threshold,
+            seed: 1,
+            jump_max_step_m: core.jump.max_step,
+            jump_policy: Jump::Reject,
+            initial_pose: None,
+            laser: None,
+            resolution: core.resolution,
+            occupied_threshold: core.map.occupied_threshold,
+            free_on_no_return: core.map.free_on_no_return,
+            xmin: -100.0,
+            ymin: -100.0,
+            xmax: 100.0,
+            ymax: 100.0,
+            llsamplerange: 0.01,
+            llsamplestep: 0.01,
+            lasamplerange: 0.005,
+            lasamplestep: 0.005,
+        }
+    }
+}
+
+/// How the laser sits on the robot.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Laser {
+    /// Metres ahead of the base.
+    pub x: f64,
+    /// Metres to the left of the base.
+    pub y: f64,
+    /// Direction it looks in, radians counter-clockwise from straight ahead.
+    pub yaw: f64,
+    /// Whether it is mounted upside down.
+    pub upside_down: bool,
+}
+
+/// Which scan matcher runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Matcher {
+    /// A cached likelihood field.
+    Field,
+    /// The original's objective and schedule.
+    Compat,
+}
+
+/// How log likelihoods become weights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Smoothing {
+    /// The same for any number of particles.
+    Fixed,
+    /// Divided by `ogain * N`: the original's rule.
+    PerParticle,
+}
+
+/// What happens when odometry jumps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Jump {
+    /// The jump is taken out.
+    Reject,
+    /// The jump is believed.
+    Continue,
+}

@@ -1,0 +1,330 @@
+//! Runs the filter over recorded readings, one after the other and as fast as it goes.
+//!
+//! The result depends on the readings, the configuration and the seed alone; the figures about
+//! time and memory come from [`crate::clock`].
+
+mod summary;
+
+use std::time::Duration;
+
+pub use summary::{
+    Counts, Hashes, PhaseSplit, PhaseTimes, Run, SampleSizes, Summary, Tiles, Timing,
+};
+
+use crate::clock::{Elapsed, Stopwatch};
+use crate::config::Config;
+use crate::evaluation::StampedPose;
+use crate::logs::Reading;
+use crate::slam::gmapping::{
+    GMapping, OccupancyGrid, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason,
+};
+use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::scan::{LaserMount, Scan};
+
+/// A filter that is fed with readings, and what came of each.
+#[derive(Debug)]
+pub struct Replay {
+    filter: GMapping,
+    mount: Option<LaserMount>,
+    track: Track,
+    counts: Counts,
+    sample_sizes: Vec<f64>,
+    resamples: u64,
+    times: ScanTimes,
+}
+
+impl Replay {
+    /// A filter as configured, before its first reading.
+    #[must_use]
+    pub fn new(config: &Config, threads: usize) -> Self {
+        Self {
+            filter: GMapping::new(config.parameters(), config.raw.seed, threads),
+            mount: config.laser_mount(),
+            track: Track::default(),
+            counts: Counts::default(),
+            sample_sizes: Vec::new(),
+            resamples: 0,
+            times: ScanTimes::default(),
+        }
+    }
+
+    /// Takes the next reading of the log.
+    pub fn add(&mut self, reading: &Reading) -> Verdict {
+        let step = self.add_odometry(reading);
+        let verdict = match (&reading.scan, step) {
+            (Some(scan), _) => self.add_scan(reading, scan),
+            (None, Step::NotFinite) => Verdict::BadOdometry,
+            (None, Step::Taken | Step::Rejected) => Verdict::OdometryOnly,
+        };
+        self.counts.add(verdict, step);
+        verdict
+    }
+
+    /// Ends the replay: the map, and the trajectory as the best particle sees it now.
+    #[must_use]
+    pub fn finish(self) -> Outcome {
+        Outcome {
+            map: self.filter.occupancy_grid(),
+            trajectory: self.track.corrected(&self.filter.path()),
+            tiles: self.filter.tile_counts().into(),
+            counts: self.counts,
+            sample_sizes: self.sample_sizes,
+            resamples: self.resamples,
+            times: self.times,
+        }
+    }
+
+    /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
+    fn add_odometry(&mut self, reading: &Reading) -> Step {
+        let odom_from_base = reading.odom_from_base;
+        let step = if !odom_from_base.is_finite() {
+            Step::NotFinite
+        } else if self.filter.add_odometry(odom_from_base) {
+            Step::Rejected
+        } else {
+            Step::Taken
+        };
+        self.track.add(reading.stamp, odom_from_base, step);
+        step
+    }
+
+    fn add_scan(&mut self, reading: &Reading, scan: &Scan) -> Verdict {
+        let mount = self.mount.as_ref().unwrap_or(&reading.mount);
+        let reading = ScanReading { scan, mount, odom_from_base: reading.odom_from_base };
+        let mut phases = [Elapsed::default(); PHASES];
+        let total = Stopwatch::start();
+        let mut phase_watch = total;
+        let update = self.filter.add_scan(&reading, &mut |phase| {
+            let spent = phase_watch.lap();
+            let sum = &mut phases[phase_index(phase)];
+            sum.wall += spent.wall;
+            sum.cpu += spent.cpu;
+        });
+        let total = total.elapsed();
+        match update {
+            ScanUpdate::Processed(report) => {
+                self.track.mark_processed();
+                self.add_report(&report);
+                self.times.add(total, phases);
+                Verdict::Processed
+            }
+            ScanUpdate::Skipped(reason) => reason.into(),
+        }
+    }
+
+    fn add_report(&mut self, report: &ScanReport) {
+        self.sample_sizes.push(report.effective_sample_size);
+        self.resamples += u64::from(report.resampled);
+    }
+}
+
+/// What a replay leaves.
+#[derive(Debug)]
+pub struct Outcome {
+    /// The map of the best particle; `None` when no scan was processed.
+    pub map: Option<OccupancyGrid>,
+    /// The pose of the base in `map` at every reading.
+    pub trajectory: Vec<StampedPose>,
+    /// Tiles of the particles' maps.
+    pub tiles: Tiles,
+    /// Readings by verdict.
+    pub counts: Counts,
+    /// The effective sample size at every processed scan.
+    pub sample_sizes: Vec<f64>,
+    /// How often particles were drawn anew.
+    pub resamples: u64,
+    /// What processed scans took.
+    pub times: ScanTimes,
+}
+
+/// What became of a reading.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Verdict {
+    /// Its scan is in the map.
+    Processed,
+    /// The robot had not moved enough since the last processed scan.
+    NotMovedEnough,
+    /// Not the n-th scan that `throttle_scans` asks for.
+    Throttled,
+    /// No beam is a hit within `maxUrange`.
+    NoUsableBeams,
+    /// Its odometry is not finite.
+    BadOdometry,
+    /// It has no scan.
+    OdometryOnly,
+}
+
+/// What became of the motion since the reading before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    Taken,
+    /// The jump guard took it for no motion.
+    Rejected,
+    /// Odometry said nothing.
+    NotFinite,
+}
+
+impl From<SkipReason> for Verdict {
+    fn from(reason: SkipReason) -> Self {
+        match reason {
+            SkipReason::Throttled => Self::Throttled,
+            SkipReason::NotMovedEnough => Self::NotMovedEnough,
+            SkipReason::NoUsableBeams => Self::NoUsableBeams,
+            SkipReason::BadOdometry => Self::BadOdometry,
+        }
+    }
+}
+
+/// How many variants [`Phase`] has.
+const PHASES: usize = 4;
+
+const fn phase_index(phase: Phase) -> usize {
+    match phase {
+        Phase::Match => 0,
+        Phase::Resample => 1,
+        Phase::Register => 2,
+        Phase::Map => 3,
+    }
+}
+
+/// Time of every processed scan, whole and by phase, in milliseconds.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ScanTimes {
+    total: Times,
+    phases: [Times; PHASES],
+}
+
+impl ScanTimes {
+    fn add(&mut self, total: Elapsed, phases: [Elapsed; PHASES]) {
+        self.total.add(total);
+        for (times, elapsed) in self.phases.iter_mut().zip(phases) {
+            times.add(elapsed);
+        }
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq)]
+struct Times {
+    wall_ms: Vec<f64>,
+    cpu_ms: Vec<f64>,
+}
+
+impl Times {
+    fn add(&mut self, elapsed: Elapsed) {
+        let milliseconds = |duration: Duration| duration.as_secs_f64() * 1e3;
+        self.wall_ms.push(milliseconds(elapsed.wall));
+        self.cpu_ms.push(milliseconds(elapsed.cpu));
+    }
+}
+
+/// Odometry of every reading, and which of them were processed.
+///
+/// Processed scans are known by their order: stamps of real logs repeat and step back.
+#[derive(Debug, Default)]
+struct Track {
+    last_odom_from_base: Option<Pose2>,
+    /// Odometry with its jumps taken out, from the first reading on.
+    readings: Vec<StampedPose>,
+    /// Indices into `readings`.
+    processed: Vec<usize>,
+}
+
+impl Track {
+    fn add(&mut self, stamp: Stamp, odom_from_base: Pose2, step: Step) {
+        let last = self.readings.last().map(|reading| reading.pose);
+        let pose = match (step, last, self.last_odom_from_base) {
+            (Step::Taken, Some(last), Some(before)) => last * before.between(odom_from_base),
+            (Step::Taken, ..) => odom_from_base,
+            (Step::Rejected | Step::NotFinite, last, _) => last.unwrap_or_default(),
+        };
+        if step != Step::NotFinite {
+            self.last_odom_from_base = Some(odom_from_base);
+        }
+        self.readings.push(StampedPose { stamp, pose });
+    }
+
+    fn mark_processed(&mut self) {
+        self.processed.push(self.readings.len().saturating_sub(1));
+    }
+
+    /// At every reading the corrected pose of the last processed scan with the odometry since;
+    /// before the first processed scan, odometry traced back from it.
+    fn corrected(self, path: &[(Stamp, Pose2)]) -> Vec<StampedPose> {
+        let mut anchors = self.processed.iter().zip(path).peekable();
+        let correction = |(&index, &(_, pose_in_map)): (&usize, &(Stamp, Pose2))| {
+            pose_in_map * self.readings[index].pose.inverse()
+        };
+        let mut map_from_odom =
+            anchors.peek().map_or(Pose2::IDENTITY, |&anchor| correction(anchor));
+        let mut trajectory = self.readings.clone();
+        for (index, reading) in trajectory.iter_mut().enumerate() {
+            if let Some(anchor) = anchors.next_if(|&(&at, _)| at == index) {
+                map_from_odom = correction(anchor);
+            }
+            reading.pose = map_from_odom * reading.pose;
+        }
+        trajectory
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn near(a: Pose2, b: Pose2) -> bool {
+        let difference = a.between(b);
+        difference.position().norm() < 1e-12 && difference.theta.abs() < 1e-12
+    }
+
+    fn track(readings: &[(Pose2, Step)], processed: &[usize]) -> Track {
+        let mut track = Track::default();
+        for (index, &(odom_from_base, step)) in readings.iter().enumerate() {
+            track.add(Stamp(0), odom_from_base, step);
+            if processed.contains(&index) {
+                track.mark_processed();
+            }
+        }
+        track
+    }
+
+    fn at(x: f64) -> Pose2 {
+        Pose2::new(x, 0.0, 0.0)
+    }
+
+    #[test]
+    fn between_processed_scans_odometry_is_appended() {
+        let turned = Pose2::new(5.0, 5.0, std::f64::consts::FRAC_PI_2);
+        let track = track(&[0.0, 1.0, 2.0, 3.0, 3.5].map(|x| (at(x), Step::Taken)), &[1, 3]);
+        let path = [(Stamp(0), turned), (Stamp(0), at(10.0))];
+        let poses: Vec<Pose2> = track.corrected(&path).into_iter().map(|p| p.pose).collect();
+        let expected = [
+            Pose2::new(5.0, 4.0, turned.theta),
+            turned,
+            Pose2::new(5.0, 6.0, turned.theta),
+            at(10.0),
+            at(10.5),
+        ];
+        assert!(poses.iter().zip(expected).all(|(&a, b)| near(a, b)), "{poses:?}");
+    }
+
+    #[test]
+    fn a_rejected_jump_is_no_motion() {
+        let readings = [
+            (at(0.0), Step::Taken),
+            (at(100.0), Step::Rejected),
+            (at(101.0), Step::Taken),
+            (Pose2::new(f64::NAN, 0.0, 0.0), Step::NotFinite),
+            (at(102.0), Step::Taken),
+        ];
+        let track = track(&readings, &[0]);
+        let poses = track.corrected(&[(Stamp(0), at(0.0))]);
+        let x: Vec<f64> = poses.iter().map(|p| p.pose.x).collect();
+        assert_eq!(x, [0.0, 0.0, 1.0, 1.0, 2.0]);
+    }
+
+    #[test]
+    fn without_a_processed_scan_the_trajectory_is_odometry() {
+        let poses = track(&[1.0, 2.0].map(|x| (at(x), Step::Taken)), &[]).corrected(&[]);
+        assert_eq!(poses.iter().map(|p| p.pose.x).collect::<Vec<_>>(), [1.0, 2.0]);
+    }
+}
