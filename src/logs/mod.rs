@@ -1,0 +1,4 @@
+//! Recorded input and output.
+
+pub mod carmen_writer;
+pub mod tum_writer;
