@@ -1,7 +1,7 @@
 //! Files that are there in full or not at all.
 
 use std::fs::{self, File};
-use std::io::{self, Write as _};
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
@@ -18,17 +18,80 @@ pub struct WriteError {
 
 /// Writes a file so that a crash leaves either its old content or all of the new.
 ///
-/// The bytes go to a temporary name in the same directory, which is renamed when they are on disk.
-///
 /// # Errors
 /// When the directory is not there or not writable, or the disk is full; the error names `path`.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
-    let temporary = temporary_name(path);
-    let written = write_and_rename(path, &temporary, bytes);
-    if written.is_err() {
-        fs::remove_file(&temporary).ok();
+    let mut file = NewFile::create(path)?;
+    let written = file.write_all(bytes);
+    written.map_err(|source| file.error(source))?;
+    file.publish()
+}
+
+/// A file that takes its name only when it is complete and on disk.
+///
+/// The bytes go to a temporary name in the same directory, which is removed unless published.
+#[derive(Debug)]
+pub struct NewFile {
+    out: BufWriter<File>,
+    path: PathBuf,
+    temporary: PathBuf,
+}
+
+impl NewFile {
+    /// Begins a file that will be called `path`.
+    ///
+    /// # Errors
+    /// When the directory is not there or not writable; the error names `path`.
+    pub fn create(path: &Path) -> Result<Self, WriteError> {
+        let temporary = temporary_name(path);
+        let path = path.to_owned();
+        match File::create(&temporary) {
+            Ok(file) => Ok(Self { out: BufWriter::new(file), path, temporary }),
+            Err(source) => Err(WriteError { path, source }),
+        }
     }
-    written.map_err(|source| WriteError { path: path.to_owned(), source })
+
+    /// A failure of writing to this file, with its name.
+    #[must_use]
+    pub fn error(&self, source: io::Error) -> WriteError {
+        WriteError { path: self.path.clone(), source }
+    }
+
+    /// Gives the file its name once its bytes are on disk.
+    ///
+    /// # Errors
+    /// When the disk is full or the name cannot be taken; the error names the file.
+    pub fn publish(mut self) -> Result<(), WriteError> {
+        self.sync_and_rename().map_err(|source| self.error(source))
+    }
+
+    fn sync_and_rename(&mut self) -> io::Result<()> {
+        self.out.flush()?;
+        self.out.get_ref().sync_all()?;
+        fs::rename(&self.temporary, &self.path)?;
+        // The rename itself is on disk only when the directory is.
+        let directory = match self.path.parent() {
+            Some(parent) if parent != Path::new("") => parent,
+            _ => Path::new("."),
+        };
+        File::open(directory)?.sync_all()
+    }
+}
+
+impl Write for NewFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.out.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.flush()
+    }
+}
+
+impl Drop for NewFile {
+    fn drop(&mut self) {
+        fs::remove_file(&self.temporary).ok();
+    }
 }
 
 /// Two processes that write the same file do not share a temporary name.
@@ -37,19 +100,6 @@ fn temporary_name(path: &Path) -> PathBuf {
     name.push(path.file_name().unwrap_or_default());
     name.push(format!(".{}.tmp", std::process::id()));
     path.with_file_name(name)
-}
-
-fn write_and_rename(path: &Path, temporary: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = File::create(temporary)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    fs::rename(temporary, path)?;
-    // The rename itself is on disk only when the directory is.
-    let directory = match path.parent() {
-        Some(parent) if parent != Path::new("") => parent,
-        _ => Path::new("."),
-    };
-    File::open(directory)?.sync_all()
 }
 
 #[cfg(test)]

@@ -1,14 +1,23 @@
 //! 2D laser mapping for robots on a Zenoh mesh.
+//!
+//! The modules in the order in which to read them:
+//!
+//! - [`slam`]: the pure core, poses to particle filter;
+//! - [`sim`]: made-up worlds, lasers and odometry with exact truth;
+//! - [`logs`]: recorded input;
+//! - [`config`]: the one configuration file;
+//! - [`replay`]: a log through the filter, and what came of it;
+//! - [`map`]: maps as pictures and map_server files;
+//! - [`evaluation`]: how far a trajectory is from the truth;
+//! - [`files`], [`clock`], [`statistics`]: whole files, clocks, percentiles.
 
-pub mod sim;
-pub mod slam;
-
+pub mod clock;
 pub mod config;
 pub mod evaluation;
 pub mod files;
 pub mod logs;
 pub mod map;
-
-pub mod clock;
 pub mod replay;
+pub mod sim;
+pub mod slam;
 pub mod statistics;

@@ -3,6 +3,7 @@
 mod evaluate;
 mod progress;
 mod replay;
+mod simulate;
 
 use clap::{Parser, Subcommand};
 
@@ -11,6 +12,7 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd simulate --out sim.log                   make a log to try\n  \
         gmapd replay run.log --out out                 map a recorded run\n  \
         gmapd replay run.log --set particles=60        with more particles\n  \
         gmapd evaluate out/trajectory.tum run.relations\n\n\
@@ -27,6 +29,8 @@ pub(crate) struct Arguments {
 pub(crate) enum Command {
     /// Map a recorded run
     Replay(replay::Arguments),
+    /// Drive a simulated robot and record what it sees
+    Simulate(simulate::SimulateArgs),
     /// Compare a trajectory with known relations between its poses
     Evaluate(evaluate::Arguments),
 }
@@ -35,6 +39,7 @@ pub(crate) enum Command {
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
         Command::Replay(arguments) => replay::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
     }
 }

@@ -4,6 +4,7 @@
 //! recordings exist whose stamps repeat and step back.
 
 pub mod carmen;
+pub mod carmen_writer;
 mod lines;
 
 use std::collections::BTreeMap;

@@ -3,6 +3,7 @@
 use rand::Rng;
 
 use super::random::{Purpose, generator};
+use super::route::shifted;
 use super::shape::{Circle, Segment, minus, outline, plus, rectangle};
 use super::site::Site;
 use super::tour;
@@ -249,9 +250,15 @@ impl Plan {
         }
         for block in self.blocks() {
             let cabinets = cabinets(&block, rng).into_iter();
-            boxes.extend(cabinets.filter(|sides| is_clear(sides)).flatten());
+            let indoors = |s: &Segment| self.contains(s.a);
+            let stands = |sides: &[Segment; 4]| is_clear(sides) && sides.iter().all(indoors);
+            boxes.extend(cabinets.filter(stands).flatten());
         }
         (boxes, pillars)
+    }
+
+    fn contains(&self, point: Point2) -> bool {
+        (0.0..self.size).contains(&point.x) && (0.0..self.size).contains(&point.y)
     }
 
     /// Every line the robot may drive along.
@@ -340,7 +347,7 @@ fn cabinets(block: &Block, rng: &mut impl Rng) -> Vec<[Segment; 4]> {
             let depth = rng.random_range(0.15..0.35);
             let start = rng.random_range(0.3..side.length() - width - 0.3);
             let wall = Segment::new(side.point_at(start), side.point_at(start + width));
-            let front = super::route::shifted(wall, -depth);
+            let front = shifted(wall, -depth);
             found.push(outline([wall.a, wall.b, front.b, front.a]));
         }
     }

@@ -664,19 +664,30 @@ impl PreparedScan {
         let mut before: Option<(f64, f64)> = None;
         let inc = geometry.angle_increment().abs();
         for e in &ends {
-            let now = (e.kind == BeamEndKind::Hit).then(|| (f64::from(e.point[0]) / parameters.resolution, f64::from(e.point[1]) / parameters.resolution));
+            let now = (e.kind == BeamEndKind::Hit).then(|| {
+                (
+                    f64::from(e.point[0]) / parameters.resolution,
+                    f64::from(e.point[1]) / parameters.resolution,
+                )
+            });
             if let (Some(a), Some(b)) = (before, now) {
                 let d = ((a.0 - b.0).powi(2) + (a.1 - b.1).powi(2)).sqrt();
                 let r = (a.0 * a.0 + a.1 * a.1).sqrt().min((b.0 * b.0 + b.1 * b.1).sqrt());
-                if d > parameters.matcher.spacing && d < gap && d < parameters.matcher.incidence * r * inc {
+                if d > parameters.matcher.spacing
+                    && d < gap
+                    && d < parameters.matcher.incidence * r * inc
+                {
                     let k = (d / parameters.matcher.spacing).ceil();
                     for i in 1..k as usize {
                         let f = i as f64 / k;
-                        surface.push(((a.0 + f * (b.0 - a.0)) as f32, (a.1 + f * (b.1 - a.1)) as f32));
+                        surface
+                            .push(((a.0 + f * (b.0 - a.0)) as f32, (a.1 + f * (b.1 - a.1)) as f32));
                     }
                 }
             }
-            if let Some(b) = now { surface.push((b.0 as f32, b.1 as f32)); }
+            if let Some(b) = now {
+                surface.push((b.0 as f32, b.1 as f32));
+            }
             before = now;
         }
         let surface: Points = surface.into_iter().collect();

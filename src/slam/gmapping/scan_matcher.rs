@@ -126,7 +126,9 @@ impl FieldMatcher {
             for sign in [-1.0, 1.0] {
                 let pose = start.turned(sign * f64::from(i) * self.parameters.sweep_step);
                 let score = window.score(points, pose);
-                if f64::from(score) > self.parameters.sweep_bias * f64::from(best_score) { (best, best_score) = (pose, score); }
+                if f64::from(score) > self.parameters.sweep_bias * f64::from(best_score) {
+                    (best, best_score) = (pose, score);
+                }
             }
         }
         while level < self.parameters.climb_levels {
