@@ -139,6 +139,12 @@ pub struct MatcherParameters {
     /// experiment
     pub gap: f64,
     /// experiment
+    pub robust: bool,
+    /// experiment
+    pub tail: f64,
+    /// experiment
+    pub tail_sigma: f64,
+    /// experiment
     pub sweep: u32,
     /// experiment
     pub sweep_step: f64,
@@ -173,6 +179,9 @@ impl Default for MatcherParameters {
             hit_fraction: 0.9,
             like_sigma: 0.1,
             gap: 0.5,
+            robust: true,
+            tail: 0.0,
+            tail_sigma: 0.1,
             sweep: 0,
             sweep_step: 0.1,
             sweep_bias: 1.0,
@@ -210,6 +219,8 @@ pub struct Weighting {
     pub reference: f64,
     /// experiment
     pub per_beam: bool,
+    /// experiment
+    pub conditional: f64,
 }
 
 impl Weighting {
@@ -233,6 +244,7 @@ impl Default for Weighting {
             motion_scale: 1.0,
             reference: 30.0,
             per_beam: true,
+            conditional: 1.0,
         }
     }
 }
@@ -354,8 +366,7 @@ impl GMapping {
             matcher,
             kernel: Kernel::new(
                 parameters.matcher.field_sigma / parameters.resolution,
-                parameters.matcher.known,
-            ),
+                parameters.matcher.known, parameters.matcher.tail, parameters.matcher.tail_sigma / parameters.resolution),
             particles: Vec::new(),
             tree: TrajectoryTree::default(),
             output: OutputMap::new(parameters.resolution),
@@ -484,15 +495,11 @@ impl GMapping {
             let mut pose = found.pose_in_map;
             if weighting.proposal > 0.0 {
                 let mut g = streams.gaussian(Purpose::Proposal, step, i);
-                if let Some(c) = found.covariance.cholesky() {
-                    let v = c.l()
-                        * nalgebra::Vector3::new(g.draw(), g.draw(), g.draw())
-                        * weighting.proposal;
-                    pose = Pose2::new(
-                        pose.x + v[0],
-                        pose.y + v[1],
-                        pose::wrap_angle(pose.theta + v[2]),
-                    );
+                let c = found.covariance;
+                if c[(2, 2)] > 0.0 {
+                    let turn = g.draw() * weighting.proposal * c[(2, 2)].sqrt();
+                    let k = weighting.conditional * turn / c[(2, 2)];
+                    pose = Pose2::new(pose.x + k * c[(0, 2)], pose.y + k * c[(1, 2)], pose::wrap_angle(pose.theta + turn));
                 }
             }
             particle.pose_in_map = pose;
@@ -556,6 +563,13 @@ impl GMapping {
             first,
             |best, p| if p.total_log_weight > best.total_log_weight { p } else { best },
         )
+    }
+
+    /// experiment
+    pub fn conflict(&self) -> (f64, usize) {
+        let (mut a, mut b, mut occ) = (0.0, 0.0, 0);
+        for (_, t) in self.output.map.counts().tiles() { for c in t { a += f64::from(c.hits.min(c.visits - c.hits)); b += f64::from(c.hits); occ += usize::from(c.hits as f64 > 0.25 * c.visits as f64); } }
+        (a / b, occ)
     }
 
     /// Particles.

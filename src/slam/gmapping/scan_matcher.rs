@@ -56,6 +56,7 @@ impl FieldMatcher {
             // closeness = exp(-d²/2s²)
             let d2 = -2.0 * p.field_sigma * p.field_sigma * libm::log(closeness.max(1e-6));
             match p.likelihood {
+                2 => libm::log(p.hit_fraction * closeness + 1.0 - p.hit_fraction),
                 0 => {
                     if d2.sqrt() < p.cut {
                         -d2 / p.likelihood_sigma
@@ -94,11 +95,13 @@ impl FieldMatcher {
         let prior = scale * prior * scale;
         let (pose, fit) = self.polish(&window, &points.all, climbed, origin, &prior);
         let mut log_likelihood = 0.0;
+        let (mut rs, mut rn) = (0.0, 0.0);
         window.for_each_value(&points.all, pose, |value| {
             log_likelihood += self.log_likelihoods[usize::from(value)];
+            if value > 40 { rn += 1.0; let e = 1.0 - f64::from(value) / 255.0; rs += e * e; }
         });
         let score = points.all.len() as f64 - f64::from(fit.cost);
-        let residual = (f64::from(fit.cost) / points.all.len() as f64).max(1e-3);
+        let residual: f64 = if self.parameters.robust { (rs / f64::max(rn, 1.0)).max(1e-3) } else { (f64::from(fit.cost) / points.all.len() as f64).max(1e-3) };
         let information = information(&fit) / residual + prior;
         let covariance = scale * information.try_inverse().unwrap_or_else(Matrix3::zeros) * scale;
         Match {

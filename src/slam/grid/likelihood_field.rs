@@ -313,8 +313,8 @@ pub struct Kernel {
 impl Kernel {
     /// A kernel of standard deviation `sigma`, in cells.
     #[must_use]
-    pub fn new(sigma: f64, known: u8) -> Self {
-        let radius = libm::ceil(3.0 * sigma) as i32;
+    pub fn new(sigma: f64, known: u8, tail: f64, tail_sigma: f64) -> Self {
+        let radius = libm::ceil(if tail > 0.0 { 2.5 * tail_sigma } else { 3.0 * sigma }) as i32;
         let phase = |p: usize| (p as f64 + 0.5) / PHASES as f64;
         let stamps = (0..PHASES * PHASES).map(|p| {
             let (hit_x, hit_y) = (phase(p % PHASES), phase(p / PHASES));
@@ -325,7 +325,7 @@ impl Kernel {
                 })
                 .map(|(x, y)| {
                     let squared = (x - hit_x) * (x - hit_x) + (y - hit_y) * (y - hit_y);
-                    libm::round(255.0 * libm::exp(-0.5 * squared / (sigma * sigma))) as u8
+                    libm::round(255.0 * ((1.0 - tail) * libm::exp(-0.5 * squared / (sigma * sigma)) + tail * libm::exp(-0.5 * squared / (tail_sigma * tail_sigma)))) as u8
                 })
                 .collect()
         });
