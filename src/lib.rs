@@ -6,6 +6,7 @@
 //! - [`sim`]: made-up worlds, lasers and odometry with exact truth;
 //! - [`logs`]: recorded input;
 //! - [`config`]: the one configuration file;
+//! - [`ros`]: ROS 2 messages and their bytes;
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
@@ -18,6 +19,7 @@ pub mod files;
 pub mod logs;
 pub mod map;
 pub mod replay;
+pub mod ros;
 pub mod sim;
 pub mod slam;
 pub mod statistics;
