@@ -7,6 +7,7 @@
 //! - [`logs`]: recorded input;
 //! - [`config`]: the one configuration file;
 //! - [`ros`]: ROS 2 messages and their bytes;
+//! - [`timeline`], [`tf`]: odometry and frames between two messages;
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
@@ -23,3 +24,5 @@ pub mod ros;
 pub mod sim;
 pub mod slam;
 pub mod statistics;
+pub mod tf;
+pub mod timeline;

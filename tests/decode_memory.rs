@@ -14,6 +14,14 @@ use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 #[global_allocator]
 static MEMORY: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
+/// One test, for the count is that of the whole process.
+#[test]
+fn decoders_allocate_by_the_bytes_that_are_there() {
+    allocation_is_bounded_by_the_input();
+    a_claimed_length_costs_nothing();
+    the_largest_list_stays_within_the_bound();
+}
+
 /// The most a list may take a byte of input, regrown as it is: a list of statuses with empty
 /// strings.
 const BYTES_A_BYTE: usize = 40;
@@ -50,7 +58,6 @@ fn words() -> impl Strategy<Value = [u8; 4]> {
 }
 
 proptest! {
-    #[test]
     fn allocation_is_bounded_by_the_input(words in vec(words(), 0..400)) {
         let bytes = [vec![[0, 1, 0, 0]], words].concat().concat();
         let most = BYTES_A_BYTE * bytes.len() + ALLOWANCE;
@@ -60,7 +67,6 @@ proptest! {
 }
 
 /// A frame id, and then a list, that claim four thousand million elements.
-#[test]
 fn a_claimed_length_costs_nothing() {
     let frame = [[0, 1, 0, 0], [0; 4], [0; 4], [0xf0, 0xff, 0xff, 0xff], [0; 4]].concat();
     assert!(worst(&frame) < ALLOWANCE);
@@ -69,7 +75,6 @@ fn a_claimed_length_costs_nothing() {
 }
 
 /// An honest list is the worst case of the bound above: it is kept whole.
-#[test]
 fn the_largest_list_stays_within_the_bound() {
     let empty_statuses = [vec![0, 1, 0, 0], vec![0; 12], 10_000_u32.to_le_bytes().to_vec()];
     let bytes = [empty_statuses.concat(), vec![0; 20 * 10_000]].concat();
