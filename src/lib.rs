@@ -7,6 +7,7 @@
 //! - [`logs`]: recorded input;
 //! - [`config`]: the one configuration file;
 //! - [`ros`]: ROS 2 messages and their bytes;
+//! - [`convert`]: from messages to the core and back;
 //! - [`timeline`], [`tf`]: odometry and frames between two messages;
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`map`]: maps as pictures and map_server files;
@@ -15,6 +16,7 @@
 
 pub mod clock;
 pub mod config;
+pub mod convert;
 pub mod evaluation;
 pub mod files;
 pub mod logs;
