@@ -180,13 +180,13 @@ impl TfBuffer {
     ///
     /// # Errors
     /// When it does not fit in with the others; it is counted, and nothing changes.
-    pub fn insert(&mut self, transform: Transform, kind: Kind) -> Result<(), RefusedTransform> {
+    pub fn insert(&mut self, transform: &Transform, kind: Kind) -> Result<(), RefusedTransform> {
         let inserted = self.try_insert(transform, kind);
         self.refused += u64::from(inserted.is_err());
         inserted
     }
 
-    fn try_insert(&mut self, transform: Transform, kind: Kind) -> Result<(), RefusedTransform> {
+    fn try_insert(&mut self, transform: &Transform, kind: Kind) -> Result<(), RefusedTransform> {
         let parent = without_slash(&transform.parent);
         let child = without_slash(&transform.child);
         let known = self.links.get(child);
@@ -393,10 +393,10 @@ mod tests {
         let mut buffer = TfBuffer::new(Duration::from_secs(10));
         for at in [0, 100, 200] {
             let base = transform("odom", "base", at, place(at as f64 / 1000.0, 0.0));
-            buffer.insert(base, Kind::Dynamic).unwrap();
+            buffer.insert(&base, Kind::Dynamic).unwrap();
         }
-        buffer.insert(transform("base", "laser", 0, place(0.5, 3.0)), Kind::Static).unwrap();
-        buffer.insert(transform("base", "camera", 0, place(-0.5, 0.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("base", "laser", 0, place(0.5, 3.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("base", "camera", 0, place(-0.5, 0.0)), Kind::Static).unwrap();
         buffer
     }
 
@@ -418,7 +418,7 @@ mod tests {
     #[test]
     fn a_leading_slash_is_no_part_of_a_name() {
         let mut buffer = robot();
-        buffer.insert(transform("/odom", "/base", 300, place(0.3, 0.0)), Kind::Dynamic).unwrap();
+        buffer.insert(&transform("/odom", "/base", 300, place(0.3, 0.0)), Kind::Dynamic).unwrap();
         assert!(buffer.target_from_source("/odom", "base", stamp(250)).is_ok());
         assert_eq!(buffer.frames(), ["base", "camera", "laser", "odom"]);
     }
@@ -440,7 +440,7 @@ mod tests {
              too new"
         );
         assert_eq!(error(&buffer, "map", "laser", 0), "no transform names the frame `map`");
-        buffer.insert(transform("map", "door", 0, place(0.0, 0.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("map", "door", 0, place(0.0, 0.0)), Kind::Static).unwrap();
         assert_eq!(
             error(&buffer, "door", "laser", 0),
             "`door` and `laser` are not connected: the one hangs from `map`, the other from `odom`"
@@ -450,12 +450,12 @@ mod tests {
     #[test]
     fn rings_are_refused() {
         let mut buffer = robot();
-        let error = buffer.insert(transform("laser", "odom", 0, place(0.0, 0.0)), Kind::Static);
+        let error = buffer.insert(&transform("laser", "odom", 0, place(0.0, 0.0)), Kind::Static);
         assert_eq!(
             error.unwrap_err().to_string(),
             "`odom` cannot hang from `laser`: that one hangs from `odom` already"
         );
-        let own = buffer.insert(transform("base", "base", 0, place(0.0, 0.0)), Kind::Dynamic);
+        let own = buffer.insert(&transform("base", "base", 0, place(0.0, 0.0)), Kind::Dynamic);
         assert!(matches!(own, Err(RefusedTransform::Cycle { .. })));
         assert_eq!(buffer.counts().refused, 2);
         assert!(buffer.target_from_source("odom", "laser", stamp(0)).is_ok());
@@ -464,14 +464,14 @@ mod tests {
     #[test]
     fn the_latest_message_decides_what_a_frame_hangs_from() {
         let mut buffer = robot();
-        buffer.insert(transform("base", "laser", 1, place(0.7, 0.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("base", "laser", 1, place(0.7, 0.0)), Kind::Static).unwrap();
         assert_eq!(buffer.counts().moved, 0);
-        buffer.insert(transform("camera", "laser", 1, place(0.1, 0.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("camera", "laser", 1, place(0.1, 0.0)), Kind::Static).unwrap();
         let base_from_laser = buffer.target_from_source("base", "laser", stamp(0)).unwrap();
         assert!(near(&base_from_laser, &place(-0.4, 0.0)), "{base_from_laser}");
 
-        buffer.insert(transform("odom", "base", 0, place(9.0, 0.0)), Kind::Dynamic).unwrap();
-        buffer.insert(transform("odom", "base", 0, place(9.0, 0.0)), Kind::Static).unwrap();
+        buffer.insert(&transform("odom", "base", 0, place(9.0, 0.0)), Kind::Dynamic).unwrap();
+        buffer.insert(&transform("odom", "base", 0, place(9.0, 0.0)), Kind::Static).unwrap();
         let odom_from_base = buffer.target_from_source("odom", "base", stamp(99_999)).unwrap();
         assert!(near(&odom_from_base, &place(9.0, 0.0)));
         let counts = buffer.counts();
@@ -482,7 +482,7 @@ mod tests {
     fn frames_and_their_names_are_bounded() {
         let mut buffer = TfBuffer::new(Duration::from_secs(10));
         let mut hang = |child: &str| {
-            buffer.insert(transform("base", child, 0, place(0.0, 0.0)), Kind::Dynamic)
+            buffer.insert(&transform("base", child, 0, place(0.0, 0.0)), Kind::Dynamic)
         };
         for index in 0..MOST_FRAMES {
             hang(&format!("frame{index}")).unwrap();
@@ -526,7 +526,7 @@ mod tests {
         #[test]
         fn there_and_back_is_the_identity(at in 0..200_i64, yaw in -3.0..3.0_f64) {
             let mut buffer = robot();
-            buffer.insert(transform("base", "arm", 0, place(0.3, yaw)), Kind::Static).unwrap();
+            buffer.insert(&transform("base", "arm", 0, place(0.3, yaw)), Kind::Static).unwrap();
             let odom_from_arm = buffer.target_from_source("odom", "arm", stamp(at)).unwrap();
             let arm_from_odom = buffer.target_from_source("arm", "odom", stamp(at)).unwrap();
             prop_assert!(near(&(odom_from_arm * arm_from_odom), &Isometry3::identity()));

@@ -46,7 +46,8 @@ pub fn text(grid: &OccupancyGrid, columns: NonZeroUsize, robot_in_map: Option<Po
         text.extend(line);
         text.push('\n');
     }
-    drawing.write_legend(grid.resolution, robot.is_some(), &mut text);
+    drawing.write_legend(grid.resolution, &mut text);
+    text.push_str(if robot.is_some() { ", arrow: robot\n" } else { "\n" });
     text
 }
 
@@ -148,13 +149,12 @@ impl Drawing {
         }
     }
 
-    fn write_legend(&self, resolution: f64, robot: bool, text: &mut String) {
+    fn write_legend(&self, resolution: f64, text: &mut String) {
         let metres = |cells: usize| cells as f64 * resolution;
         let character = 2.0 * self.cells_across * resolution;
         let (width, height) = (metres(self.columns.len()), metres(self.rows.len()));
         write!(text, "{width:.1} x {height:.1} m, a character is {character:.2} x ").ok();
         write!(text, "{:.2} m: █ obstacle, {UNKNOWN} unknown", 2.0 * character).ok();
-        text.push_str(if robot { ", arrow: robot\n" } else { "\n" });
     }
 }
 
