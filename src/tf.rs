@@ -481,18 +481,21 @@ mod tests {
     #[test]
     fn frames_and_their_names_are_bounded() {
         let mut buffer = TfBuffer::new(Duration::from_secs(10));
-        let mut hang = |child: &str| {
-            buffer.insert(&transform("base", child, 0, place(0.0, 0.0)), Kind::Dynamic)
+        let mut hang_from = |parent: &str, child: &str| {
+            buffer.insert(&transform(parent, child, 0, place(0.0, 0.0)), Kind::Dynamic)
         };
-        for index in 0..MOST_FRAMES {
+        hang_from("map", "base").unwrap();
+        let mut hang = |child: &str| hang_from("base", child);
+        for index in 1..MOST_FRAMES {
             hang(&format!("frame{index}")).unwrap();
         }
         let error = hang("one_more").unwrap_err();
         assert_eq!(error.to_string(), "no room for `one_more`: 256 frames are known already");
-        hang("frame0").unwrap();
+        hang("frame1").unwrap();
         assert_eq!(hang("").unwrap_err(), RefusedTransform::Name(0));
         let error = hang(&"x".repeat(257)).unwrap_err();
         assert_eq!(error.to_string(), "a frame's name has 257 bytes; 1 to 256 are possible");
+        hang_from("frame1", "frame2").unwrap();
         assert_eq!(buffer.counts().refused, 3);
     }
 
