@@ -6,6 +6,9 @@
 //! - [`sim`]: made-up worlds, lasers and odometry with exact truth;
 //! - [`logs`]: recorded input;
 //! - [`config`]: the one configuration file;
+//! - [`ros`]: ROS 2 messages and their bytes;
+//! - [`convert`]: from messages to the core and back;
+//! - [`timeline`], [`tf`]: odometry and frames between two messages;
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
@@ -13,11 +16,15 @@
 
 pub mod clock;
 pub mod config;
+pub mod convert;
 pub mod evaluation;
 pub mod files;
 pub mod logs;
 pub mod map;
 pub mod replay;
+pub mod ros;
 pub mod sim;
 pub mod slam;
 pub mod statistics;
+pub mod tf;
+pub mod timeline;

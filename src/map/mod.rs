@@ -1,7 +1,15 @@
-//! The map as files: for navigation (PGM and YAML) and for people (PNG).
+//! The map as files, for navigation (PGM and YAML) and for people (PNG), and as answers to who asks:
+//! drawn with characters, as JSON, and as a hash.
 
+mod bounds;
+mod hash;
+mod json;
 mod pgm;
 mod picture;
+mod text;
 
+pub use hash::content_hash;
+pub use json::json;
 pub use pgm::{pgm, yaml};
 pub use picture::png;
+pub use text::text;

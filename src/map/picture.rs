@@ -1,5 +1,6 @@
 //! `map.png`: the map as people want to look at it, with the way the robot took.
 
+use super::bounds::known_bounds;
 use crate::slam::gmapping::OccupancyGrid;
 use crate::slam::pose::Point2;
 
@@ -149,27 +150,6 @@ impl Canvas {
         drop(writer);
         Ok(bytes)
     }
-}
-
-/// The columns and rows that hold every known cell; empty ranges when none is known.
-fn known_bounds(grid: &OccupancyGrid) -> [std::ops::Range<usize>; 2] {
-    let known = |row: &[i8]| row.iter().any(|&cell| cell >= 0);
-    let mut rows = 0..0;
-    let mut columns = 0..0;
-    for (iy, row) in grid.cells.chunks_exact(grid.width.max(1)).enumerate() {
-        if !known(row) {
-            continue;
-        }
-        rows = if rows.is_empty() { iy..iy + 1 } else { rows.start..iy + 1 };
-        let first = row.iter().position(|&cell| cell >= 0).unwrap_or(0);
-        let last = row.iter().rposition(|&cell| cell >= 0).unwrap_or(0);
-        columns = if columns.is_empty() {
-            first..last + 1
-        } else {
-            columns.start.min(first)..columns.end.max(last + 1)
-        };
-    }
-    [columns, rows]
 }
 
 #[cfg(test)]
