@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3};
 use thiserror::Error;
 
 use crate::ros;
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::{Pose2, Stamp, wrap_angle};
 use crate::slam::scan::{GeometryError, LaserMount, MountOrientation, Scan, ScanGeometry};
 use crate::tf;

@@ -16,8 +16,9 @@ use crate::config::Config;
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
 use crate::slam::gmapping::{
-    GMapping, OccupancyGrid, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason,
+    GMapping, OdometryUpdate, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason, ThreadsError,
 };
+use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
 
@@ -35,17 +36,19 @@ pub struct Replay {
 
 impl Replay {
     /// A filter as configured, before its first reading.
-    #[must_use]
-    pub fn new(config: &Config, threads: usize) -> Self {
-        Self {
-            filter: GMapping::new(config.parameters(), config.raw.seed, threads),
+    ///
+    /// # Errors
+    /// When the threads cannot be started.
+    pub fn new(config: &Config, threads: usize) -> Result<Self, ThreadsError> {
+        Ok(Self {
+            filter: GMapping::new(config.parameters(), config.raw.seed, threads)?,
             mount: config.laser_mount(),
             track: Track::default(),
             counts: Counts::default(),
             sample_sizes: Vec::new(),
             resamples: 0,
             times: ScanTimes::default(),
-        }
+        })
     }
 
     /// Takes the next reading of the log.
@@ -53,8 +56,10 @@ impl Replay {
         let step = self.add_odometry(reading);
         let verdict = match (&reading.scan, step) {
             (Some(scan), _) => self.add_scan(reading, scan),
-            (None, Step::NotFinite) => Verdict::BadOdometry,
-            (None, Step::Taken | Step::Rejected) => Verdict::OdometryOnly,
+            (None, OdometryUpdate::NotUsable) => Verdict::BadOdometry,
+            (None, OdometryUpdate::Accepted | OdometryUpdate::JumpRejected) => {
+                Verdict::OdometryOnly
+            }
         };
         self.counts.add(verdict, step);
         verdict
@@ -66,7 +71,7 @@ impl Replay {
         Outcome {
             map: self.filter.occupancy_grid(),
             trajectory: self.track.corrected(&self.filter.path()),
-            tiles: self.filter.tile_counts().into(),
+            tiles: self.filter.particle_tiles().into(),
             counts: self.counts,
             sample_sizes: self.sample_sizes,
             resamples: self.resamples,
@@ -75,15 +80,9 @@ impl Replay {
     }
 
     /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
-    fn add_odometry(&mut self, reading: &Reading) -> Step {
+    fn add_odometry(&mut self, reading: &Reading) -> OdometryUpdate {
         let odom_from_base = reading.odom_from_base;
-        let step = if !odom_from_base.is_finite() {
-            Step::NotFinite
-        } else if self.filter.add_odometry(odom_from_base) {
-            Step::Rejected
-        } else {
-            Step::Taken
-        };
+        let step = self.filter.add_odometry(odom_from_base);
         self.track.add(reading.stamp, odom_from_base, step);
         step
     }
@@ -148,20 +147,10 @@ pub enum Verdict {
     Throttled,
     /// No beam is a hit within `maxUrange`.
     NoUsableBeams,
-    /// Its odometry is not finite.
+    /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
     /// It has no scan.
     OdometryOnly,
-}
-
-/// What became of the motion since the reading before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
-    Taken,
-    /// The jump guard took it for no motion.
-    Rejected,
-    /// Odometry said nothing.
-    NotFinite,
 }
 
 impl From<SkipReason> for Verdict {
@@ -230,14 +219,18 @@ struct Track {
 }
 
 impl Track {
-    fn add(&mut self, stamp: Stamp, odom_from_base: Pose2, step: Step) {
+    fn add(&mut self, stamp: Stamp, odom_from_base: Pose2, step: OdometryUpdate) {
         let last = self.readings.last().map(|reading| reading.pose);
         let pose = match (step, last, self.last_odom_from_base) {
-            (Step::Taken, Some(last), Some(before)) => last * before.between(odom_from_base),
-            (Step::Taken, ..) => odom_from_base,
-            (Step::Rejected | Step::NotFinite, last, _) => last.unwrap_or_default(),
+            (OdometryUpdate::Accepted, Some(last), Some(before)) => {
+                last * before.between(odom_from_base)
+            }
+            (OdometryUpdate::Accepted, ..) => odom_from_base,
+            (OdometryUpdate::JumpRejected | OdometryUpdate::NotUsable, last, _) => {
+                last.unwrap_or_default()
+            }
         };
-        if step != Step::NotFinite {
+        if step != OdometryUpdate::NotUsable {
             self.last_odom_from_base = Some(odom_from_base);
         }
         self.readings.push(StampedPose { stamp, pose });
@@ -276,7 +269,7 @@ mod tests {
         difference.position().norm() < 1e-12 && difference.theta.abs() < 1e-12
     }
 
-    fn track(readings: &[(Pose2, Step)], processed: &[usize]) -> Track {
+    fn track(readings: &[(Pose2, OdometryUpdate)], processed: &[usize]) -> Track {
         let mut track = Track::default();
         for (index, &(odom_from_base, step)) in readings.iter().enumerate() {
             track.add(Stamp(0), odom_from_base, step);
@@ -294,7 +287,8 @@ mod tests {
     #[test]
     fn between_processed_scans_odometry_is_appended() {
         let turned = Pose2::new(5.0, 5.0, std::f64::consts::FRAC_PI_2);
-        let track = track(&[0.0, 1.0, 2.0, 3.0, 3.5].map(|x| (at(x), Step::Taken)), &[1, 3]);
+        let track =
+            track(&[0.0, 1.0, 2.0, 3.0, 3.5].map(|x| (at(x), OdometryUpdate::Accepted)), &[1, 3]);
         let path = [(Stamp(0), turned), (Stamp(0), at(10.0))];
         let poses: Vec<Pose2> = track.corrected(&path).into_iter().map(|p| p.pose).collect();
         let expected = [
@@ -310,11 +304,11 @@ mod tests {
     #[test]
     fn a_rejected_jump_is_no_motion() {
         let readings = [
-            (at(0.0), Step::Taken),
-            (at(100.0), Step::Rejected),
-            (at(101.0), Step::Taken),
-            (Pose2::new(f64::NAN, 0.0, 0.0), Step::NotFinite),
-            (at(102.0), Step::Taken),
+            (at(0.0), OdometryUpdate::Accepted),
+            (at(100.0), OdometryUpdate::JumpRejected),
+            (at(101.0), OdometryUpdate::Accepted),
+            (Pose2::new(f64::NAN, 0.0, 0.0), OdometryUpdate::NotUsable),
+            (at(102.0), OdometryUpdate::Accepted),
         ];
         let track = track(&readings, &[0]);
         let poses = track.corrected(&[(Stamp(0), at(0.0))]);
@@ -324,7 +318,8 @@ mod tests {
 
     #[test]
     fn without_a_processed_scan_the_trajectory_is_odometry() {
-        let poses = track(&[1.0, 2.0].map(|x| (at(x), Step::Taken)), &[]).corrected(&[]);
+        let poses =
+            track(&[1.0, 2.0].map(|x| (at(x), OdometryUpdate::Accepted)), &[]).corrected(&[]);
         assert_eq!(poses.iter().map(|p| p.pose.x).collect::<Vec<_>>(), [1.0, 2.0]);
     }
 }

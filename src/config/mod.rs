@@ -80,10 +80,9 @@ impl Config {
             jump: JumpGuard { max_step: raw.jump_max_step_m, policy: raw.jump_policy.into() },
             matcher: matcher_parameters(raw),
             weighting: Weighting {
-                gain: raw.gain,
+                flatness: raw.gain,
                 smoothing: raw.weight_smoothing.into(),
                 resample_threshold: raw.resample_threshold,
-                ..Weighting::default()
             },
             map: MapParameters {
                 occupied_threshold: raw.occupied_threshold,
@@ -118,7 +117,6 @@ fn matcher_parameters(raw: &RawConfig) -> MatcherParameters {
         beam_skip: raw.beam_skip,
         minimum_score: raw.minimum_score,
         field_sigma: raw.field_sigma_m,
-        ..MatcherParameters::default()
     }
 }
 

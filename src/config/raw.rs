@@ -174,7 +174,7 @@ impl Default for RawConfig {
             kernel_size: core.matcher.kernel_size,
             likelihood_sigma: core.matcher.likelihood_sigma,
             iterations: core.matcher.iterations,
-            gain: core.weighting.gain,
+            gain: core.weighting.flatness,
             weight_smoothing: Smoothing::Fixed,
             resample_threshold: core.weighting.resample_threshold,
             seed: 1,

@@ -1,6 +1,6 @@
 //! The part of a map that is known.
 
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 
 /// The columns and rows that hold every known cell; empty ranges when none is known.
 pub(super) fn known_bounds(grid: &OccupancyGrid) -> [std::ops::Range<usize>; 2] {

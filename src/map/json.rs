@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 
 #[derive(Serialize)]
 struct Map {

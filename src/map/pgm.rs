@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 
 const FREE: u8 = 254;
 const OCCUPIED: u8 = 0;

@@ -1,7 +1,7 @@
 //! `map.png`: the map as people want to look at it, with the way the robot took.
 
 use super::bounds::known_bounds;
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::Point2;
 
 /// Cells left around what is known.

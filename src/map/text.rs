@@ -5,7 +5,7 @@ use std::num::NonZeroUsize;
 use std::ops::Range;
 
 use super::bounds::known_bounds;
-use crate::slam::gmapping::OccupancyGrid;
+use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::Pose2;
 
 /// Nothing known.

@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{Outcome, ScanTimes, Step, Times, Verdict, phase_index};
+use super::{Outcome, ScanTimes, Times, Verdict, phase_index};
 use crate::clock::{Elapsed, peak_resident_memory};
 use crate::config::{Config, RawConfig};
 use crate::logs::LogStatistics;
-use crate::slam::gmapping::Phase;
+use crate::slam::gmapping::{OdometryUpdate, Phase};
 use crate::slam::grid::tile_map::TileCounts;
 use crate::statistics::Spread;
 
@@ -104,7 +104,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    pub(super) const fn add(&mut self, verdict: Verdict, step: Step) {
+    pub(super) const fn add(&mut self, verdict: Verdict, step: OdometryUpdate) {
         let count = match verdict {
             Verdict::Processed => &mut self.processed,
             Verdict::NotMovedEnough => &mut self.not_moved_enough,
@@ -115,7 +115,7 @@ impl Counts {
         };
         *count += 1;
         self.total += 1;
-        if matches!(step, Step::Rejected) {
+        if matches!(step, OdometryUpdate::JumpRejected) {
             self.jump_rejected += 1;
         }
     }

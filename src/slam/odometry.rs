@@ -6,9 +6,9 @@ use super::pose::Pose2;
 
 /// Metres of travel and radians of turn over which the noise parameters hold as given.
 ///
-/// The original applies them to each message; these are the steps of a robot at about 0.5 m/s and
-/// 0.5 rad/s that reports at 5 to 10 Hz, as those did that the defaults were made for.
-const REFERENCE_STEP: f64 = 0.1;
+/// The original applies them to each message. This is the step of a robot at a quarter of a metre
+/// a second that reports at 10 Hz; in the Intel log of the original's authors it is 0.037 m.
+const REFERENCE_STEP: f64 = 0.025;
 /// Share of the noise along an axis that travel along the other axis adds, as in the original.
 const CROSS_AXIS: f64 = 0.3;
 
@@ -86,5 +86,46 @@ impl Motion {
         self.forward += step.x.abs();
         self.sideways += step.y.abs();
         self.turned += step.theta.abs();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn motion(steps: u32) -> Motion {
+        let mut motion = Motion::default();
+        let share = 1.0 / f64::from(steps);
+        (0..steps).for_each(|_| motion.extend(Pose2::new(2.0 * share, 0.0, 0.6 * share)));
+        motion
+    }
+
+    #[test]
+    fn noise_does_not_depend_on_the_message_rate() {
+        let noise = MotionNoise::default();
+        let [slow, fast] = [4, 400].map(|steps| noise.standard_deviations(&motion(steps)));
+        for (slow, fast) in slow.iter().zip(fast) {
+            assert!((slow / fast - 1.0).abs() < 1e-9, "{slow} {fast}");
+        }
+    }
+
+    #[test]
+    fn a_reference_step_has_the_noise_that_the_original_gives_it() {
+        let mut motion = Motion::default();
+        motion.extend(Pose2::new(REFERENCE_STEP, 0.0, 0.0));
+        let [along, across, turn] = MotionNoise::default().standard_deviations(&motion);
+        assert!((along - 0.1 * REFERENCE_STEP).abs() < 1e-12);
+        assert!((across - 0.03 * REFERENCE_STEP).abs() < 1e-12);
+        assert!((turn - 0.2 * REFERENCE_STEP).abs() < 1e-12);
+    }
+
+    #[test]
+    fn motion_counts_both_ways() {
+        let mut motion = Motion::default();
+        motion.extend(Pose2::new(1.0, 0.0, 0.5));
+        motion.extend(Pose2::new(0.0, 0.0, -0.5));
+        motion.extend(Pose2::new(-1.0, 0.0, 0.0));
+        assert_eq!((motion.path_length, motion.forward, motion.turned), (2.0, 2.0, 1.0));
+        assert!(motion.increment.position().norm() < 1e-12);
     }
 }

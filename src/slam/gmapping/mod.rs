@@ -1,277 +1,42 @@
 //! GMapping: a Rao-Blackwellized particle filter over trajectories and maps
-//! (Grisetti, Stachniss, Burgard, IEEE T-RO 23(1), 2007).
+//! (Grisetti, Stachniss, Burgard, IEEE T-RO 23(1), 2007), redesigned.
+//!
+//! [`GMapping::add_scan`] is the algorithm; each of its steps has a file of its own.
 
+pub mod compat;
 pub mod motion_model;
+pub mod output_map;
+mod parameters;
+mod particle;
+pub mod prepared_scan;
 pub mod random;
 pub mod resampling;
 pub mod scan_matcher;
 pub mod trajectory;
 
-use std::collections::VecDeque;
-
 use nalgebra::Matrix3;
+use rayon::iter::{
+    IndexedParallelIterator as _, IntoParallelRefMutIterator as _, ParallelIterator as _,
+};
+use thiserror::Error;
 
+use self::output_map::OutputMap;
+pub use self::parameters::{JumpGuard, JumpPolicy, MapParameters, Parameters};
+pub use self::particle::Particle;
+use self::particle::{ScanMatcher, Step};
+use self::prepared_scan::PreparedScan;
 use self::random::{Purpose, Streams};
-use self::scan_matcher::{FieldMatcher, MatchPoints};
-use self::trajectory::{NodeId, TrajectoryTree};
-use super::grid::Cell;
-use super::grid::likelihood_field::{Kernel, Points};
-use super::grid::occupancy::{BeamEnd, BeamEndKind, OccupancyMap, ScanOutline};
-use super::grid::tile_map::TileMap;
-use super::motion_gate::MotionGate;
-use super::odometry::{Motion, MotionNoise};
-use super::pose::{self, Pose2, Stamp};
-use super::scan::{Beam, LaserMount, Scan};
+pub use self::resampling::{WeightSmoothing, Weighting};
+pub use self::scan_matcher::{MatcherKind, MatcherParameters};
+use self::trajectory::TrajectoryTree;
+use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
+use super::grid::tile_map::TileCounts;
+use super::odometry::Motion;
+use super::pose::{Pose2, Stamp, wrap_angle};
+use super::scan::{LaserMount, Scan};
 
-/// Everything the filter can be told, grouped by the part that uses it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Parameters {
-    /// Number of hypotheses; slam_gmapping's default is 30.
-    pub particles: usize,
-    /// `throttle_scans`: every n-th scan is looked at.
-    pub throttle_scans: usize,
-    /// `delta`: metres a cell.
-    pub resolution: f64,
-    /// `maxRange`, m: readings strictly above are discarded; `None` takes the sensor's own limit.
-    pub max_range: Option<f64>,
-    /// `maxUrange`, m: readings above are not matched, and free space ends there.
-    pub max_usable_range: Option<f64>,
-    /// Where the base is in `map` at the first scan; `None` makes `map` and `odom` coincide there.
-    pub initial_pose: Option<Pose2>,
-    /// Odometry noise.
-    pub motion_noise: MotionNoise,
-    /// Which scans are processed.
-    pub gate: MotionGate,
-    /// The guard against odometry jumps.
-    pub jump: JumpGuard,
-    /// Scan matching.
-    pub matcher: MatcherParameters,
-    /// Weights and resampling.
-    pub weighting: Weighting,
-    /// The map that is handed out.
-    pub map: MapParameters,
-}
-
-impl Default for Parameters {
-    fn default() -> Self {
-        Self {
-            particles: 30,
-            throttle_scans: 1,
-            resolution: 0.05,
-            max_range: None,
-            max_usable_range: None,
-            initial_pose: None,
-            motion_noise: MotionNoise::default(),
-            gate: MotionGate::default(),
-            jump: JumpGuard::default(),
-            matcher: MatcherParameters::default(),
-            weighting: Weighting::default(),
-            map: MapParameters::default(),
-        }
-    }
-}
-
-/// What happens when odometry moves further between two readings than a robot can.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JumpGuard {
-    /// Metres between two successive odometry readings that count as a jump.
-    pub max_step: f64,
-    /// What then happens.
-    pub policy: JumpPolicy,
-}
-
-impl Default for JumpGuard {
-    fn default() -> Self {
-        Self { max_step: 20.0, policy: JumpPolicy::Reject }
-    }
-}
-
-/// What to do with a reading that jumped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum JumpPolicy {
-    /// The jump is taken out: the robot is believed not to have moved meanwhile.
-    Reject,
-    /// The jump is believed, as the original did after printing a banner.
-    Continue,
-}
-
-/// The scan matcher's settings.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MatcherParameters {
-    /// Which matcher runs.
-    pub kind: MatcherKind,
-    /// `lstep`, m: first step of the hill climb.
-    pub linear_step: f64,
-    /// `astep`, rad: first step of the hill climb.
-    pub angular_step: f64,
-    /// `iterations`: how often the compat matcher halves its steps.
-    pub iterations: u32,
-    /// `sigma`: the compat matcher's score is exp(-d^2 / sigma).
-    pub sigma: f64,
-    /// `kernelSize`, cells: the compat matcher looks this far around an endpoint.
-    pub kernel_size: u32,
-    /// `lsigma`: the compat log likelihood of a beam is -d^2 / lsigma.
-    pub likelihood_sigma: f64,
-    /// `lskip`: this many beams are passed over between two that are matched.
-    pub beam_skip: usize,
-    /// `minimumScore`: a match counts only above this score.
-    pub minimum_score: f64,
-    /// Standard deviation of the likelihood field around each hit, m.
-    pub field_sigma: f64,
-    /// experiment
-    pub known: u8,
-    /// experiment
-    pub climb_levels: u32,
-    /// experiment
-    pub polish_steps: u32,
-    /// experiment
-    pub damping: f64,
-    /// experiment
-    pub coarse_step: usize,
-    /// experiment
-    pub likelihood: u8,
-    /// experiment
-    pub cut: f64,
-    /// experiment
-    pub hit_fraction: f64,
-    /// experiment
-    pub like_sigma: f64,
-    /// experiment
-    pub gap: f64,
-    /// experiment
-    pub robust: bool,
-    /// experiment
-    pub tail: f64,
-    /// experiment
-    pub tail_sigma: f64,
-    /// experiment
-    pub sweep: u32,
-    /// experiment
-    pub sweep_step: f64,
-    /// experiment
-    pub sweep_bias: f64,
-    /// experiment
-    pub spacing: f64,
-    /// experiment
-    pub incidence: f64,
-}
-
-impl Default for MatcherParameters {
-    fn default() -> Self {
-        Self {
-            kind: MatcherKind::Field,
-            linear_step: 0.05,
-            angular_step: 0.05,
-            iterations: 5,
-            sigma: 0.05,
-            kernel_size: 1,
-            likelihood_sigma: 0.075,
-            beam_skip: 0,
-            minimum_score: 0.0,
-            field_sigma: 0.06,
-            known: 240,
-            climb_levels: 2,
-            polish_steps: 5,
-            damping: 0.0,
-            coarse_step: 2,
-            likelihood: 0,
-            cut: 0.1,
-            hit_fraction: 0.9,
-            like_sigma: 0.1,
-            gap: 0.5,
-            robust: true,
-            tail: 0.0,
-            tail_sigma: 0.1,
-            sweep: 0,
-            sweep_step: 0.1,
-            sweep_bias: 1.0,
-            spacing: 1.0,
-            incidence: 4.0,
-        }
-    }
-}
-
-/// Which scan matcher runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MatcherKind {
-    /// A cached likelihood field, a coarse climb and a Gauss-Newton polish.
-    Field,
-    /// The original's objective and schedule: slow, and the reference for tests.
-    Compat,
-}
-
-/// How weights are formed and when particles are drawn anew.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Weighting {
-    /// `ogain`: the larger, the flatter the weights.
-    pub gain: f64,
-    /// Whether weights are flattened with the number of particles, as the original does.
-    pub smoothing: WeightSmoothing,
-    /// `resampleThreshold`: resample below this fraction of N effective particles.
-    pub resample_threshold: f64,
-    /// experiment
-    pub proposal: f64,
-    /// experiment
-    pub prior: f64,
-    /// experiment
-    pub motion_scale: f64,
-    /// experiment
-    pub reference: f64,
-    /// experiment
-    pub per_beam: bool,
-    /// experiment
-    pub conditional: f64,
-}
-
-impl Weighting {
-    fn log_weight_gain(&self, particles: usize) -> f64 {
-        1.0 / (self.gain
-            * match self.smoothing {
-                WeightSmoothing::Fixed => self.reference,
-                WeightSmoothing::PerParticle => particles as f64,
-            })
-    }
-}
-
-impl Default for Weighting {
-    fn default() -> Self {
-        Self {
-            gain: 3.0,
-            smoothing: WeightSmoothing::Fixed,
-            resample_threshold: 0.5,
-            proposal: 0.0,
-            prior: 0.0,
-            motion_scale: 1.0,
-            reference: 30.0,
-            per_beam: true,
-            conditional: 1.0,
-        }
-    }
-}
-
-/// How log likelihoods become weights.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WeightSmoothing {
-    /// The same for any number of particles.
-    Fixed,
-    /// Divided by `ogain * N`: the original's rule.
-    PerParticle,
-}
-
-/// The occupancy map that is handed out.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MapParameters {
-    /// `occ_thresh`: a cell is occupied when hits / visits is above this.
-    pub occupied_threshold: f64,
-    /// Whether a beam without return marks free space out to `maxUrange`.
-    pub free_on_no_return: bool,
-}
-
-impl Default for MapParameters {
-    fn default() -> Self {
-        Self { occupied_threshold: 0.25, free_on_no_return: false }
-    }
-}
+/// Particles a thread takes at a time; fewer are not worth handing over.
+const PARTICLES_A_TASK: usize = 4;
 
 /// A scan with all that is needed to use it.
 #[derive(Debug, Clone, Copy)]
@@ -282,6 +47,17 @@ pub struct ScanReading<'a> {
     pub mount: &'a LaserMount,
     /// Where odometry says the base was when the sweep was taken.
     pub odom_from_base: Pose2,
+}
+
+/// What became of an odometry reading.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum OdometryUpdate {
+    /// Its motion counts.
+    Accepted,
+    /// It moved further than [`JumpGuard::max_step`]; the step was taken out.
+    JumpRejected,
+    /// It is not finite, or further from the origin than any robot gets; it was ignored.
+    NotUsable,
 }
 
 /// What became of a scan.
@@ -296,12 +72,18 @@ pub enum ScanUpdate {
 /// Figures about a processed scan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScanReport {
+    /// Hits that were matched.
+    pub hits: usize,
+    /// Particles whose match was accepted; the others went on with odometry.
+    pub matched: usize,
+    /// Score of the best particle's match, up to `hits`.
+    pub best_score: f64,
     /// 1 / Σ wᵢ² before resampling, between 1 and the number of particles.
     pub effective_sample_size: f64,
+    /// −Σ wᵢ ln wᵢ before resampling, nats.
+    pub entropy: f64,
     /// Whether particles were drawn anew.
     pub resampled: bool,
-    /// Particles whose scan match was accepted.
-    pub matched: usize,
 }
 
 /// Why a scan was not processed.
@@ -313,7 +95,7 @@ pub enum SkipReason {
     NotMovedEnough,
     /// No beam is a hit within `maxUrange`.
     NoUsableBeams,
-    /// The odometry pose is not finite.
+    /// The odometry pose is not usable.
     BadOdometry,
 }
 
@@ -330,65 +112,76 @@ pub enum Phase {
     Map,
 }
 
+/// The worker threads could not be started.
+#[derive(Debug, Error)]
+#[error("cannot start {threads} threads for the particles")]
+pub struct ThreadsError {
+    threads: usize,
+    source: rayon::ThreadPoolBuildError,
+}
+
 /// The filter.
 #[derive(Debug)]
 pub struct GMapping {
     parameters: Parameters,
     streams: Streams,
+    /// `None` runs everything on the caller's thread.
     pool: Option<rayon::ThreadPool>,
-    matcher: FieldMatcher,
-    kernel: Kernel,
+    matcher: ScanMatcher,
+    /// Empty before the first scan.
     particles: Vec<Particle>,
     tree: TrajectoryTree,
     output: OutputMap,
-    odometry: Option<Pose2>,
-    since_processed: Motion,
-    last_processed: Option<Stamp>,
+    odometry: Odometry,
+    /// Of the processed scans.
     stamps: Vec<Stamp>,
     scans_seen: usize,
 }
 
+/// What odometry said last, and since the last processed scan.
+#[derive(Debug, Default)]
+struct Odometry {
+    odom_from_base: Option<Pose2>,
+    since_processed: Motion,
+}
+
 impl GMapping {
-    /// A filter with no scan yet. `threads` of 1 runs everything on the caller's thread.
-    #[must_use]
-    pub fn new(parameters: Parameters, seed: u64, threads: usize) -> Self {
-        let matcher = FieldMatcher::new(parameters.matcher, parameters.resolution);
-        let pool = (threads > 1).then(|| {
-            rayon::ThreadPoolBuilder::new()
-                .num_threads(threads)
-                .thread_name(|i| format!("particles-{i}"))
-                .build()
-                .expect("threads can be started")
-        });
-        Self {
+    /// A filter with no scan yet. `threads` of 1 or 0 runs everything on the caller's thread.
+    ///
+    /// # Errors
+    /// When the threads cannot be started.
+    pub fn new(parameters: Parameters, seed: u64, threads: usize) -> Result<Self, ThreadsError> {
+        let builder = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        let builder = builder.thread_name(|i| format!("particles-{i}"));
+        let pool = (threads > 1).then(|| builder.build()).transpose();
+        Ok(Self {
             streams: Streams::new(seed),
-            pool,
-            matcher,
-            kernel: Kernel::new(
-                parameters.matcher.field_sigma / parameters.resolution,
-                parameters.matcher.known, parameters.matcher.tail, parameters.matcher.tail_sigma / parameters.resolution),
+            pool: pool.map_err(|source| ThreadsError { threads, source })?,
+            matcher: ScanMatcher::new(parameters.matcher, parameters.resolution),
             particles: Vec::new(),
             tree: TrajectoryTree::default(),
             output: OutputMap::new(parameters.resolution),
-            odometry: None,
-            since_processed: Motion::default(),
-            last_processed: None,
+            odometry: Odometry::default(),
             stamps: Vec::new(),
             scans_seen: 0,
             parameters,
-        }
+        })
     }
 
-    /// Takes an odometry reading between scans; returns whether the jump guard rejected its step.
-    pub fn add_odometry(&mut self, odom_from_base: Pose2) -> bool {
-        let Some(before) = self.odometry.replace(odom_from_base) else { return false };
-        let step = before.between(odom_from_base);
-        let jumped = step.position().norm() > self.parameters.jump.max_step;
-        if jumped && self.parameters.jump.policy == JumpPolicy::Reject {
-            return true;
+    /// Takes an odometry reading: the base in `odom`.
+    pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
+        if !self.parameters.jump.is_usable(odom_from_base) {
+            return OdometryUpdate::NotUsable;
         }
-        self.since_processed.extend(step);
-        false
+        let Some(before) = self.odometry.odom_from_base.replace(odom_from_base) else {
+            return OdometryUpdate::Accepted;
+        };
+        let step = before.between(odom_from_base);
+        if self.parameters.jump.rejects(step) {
+            return OdometryUpdate::JumpRejected;
+        }
+        self.odometry.since_processed.extend(step);
+        OdometryUpdate::Accepted
     }
 
     /// Takes a scan; `on_phase` is called as each phase of processing ends.
@@ -397,213 +190,204 @@ impl GMapping {
         reading: &ScanReading<'_>,
         on_phase: &mut dyn FnMut(Phase),
     ) -> ScanUpdate {
-        self.scans_seen += 1;
-        self.add_odometry(reading.odom_from_base);
-        if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans) {
-            return ScanUpdate::Skipped(SkipReason::Throttled);
-        }
-        let stamp = reading.scan.stamp;
-        let elapsed = self.last_processed.map(|last| stamp.seconds_since(last));
-        if !self.parameters.gate.opens(&self.since_processed, elapsed) {
-            return ScanUpdate::Skipped(SkipReason::NotMovedEnough);
-        }
-        let scan = PreparedScan::new(reading, &self.parameters);
-        if scan.points.all.is_empty() {
-            return ScanUpdate::Skipped(SkipReason::NoUsableBeams);
-        }
-        let motion = std::mem::take(&mut self.since_processed);
-        self.last_processed = Some(stamp);
-        self.stamps.push(stamp);
-        let report = if self.particles.is_empty() {
-            self.begin(reading.odom_from_base)
-        } else {
-            self.match_particles(&scan, &motion);
-            on_phase(Phase::Match);
-            self.resample()
+        let scan = match self.admit(reading) {
+            Ok(scan) => scan,
+            Err(reason) => return ScanUpdate::Skipped(reason),
         };
+        let motion = std::mem::take(&mut self.odometry.since_processed);
+        self.stamps.push(reading.scan.stamp);
+        if self.particles.is_empty() {
+            self.begin(reading.odom_from_base);
+        } else {
+            self.match_particles(&scan, motion);
+        }
+        on_phase(Phase::Match);
+        let report = self.resample(scan.hits.len());
         on_phase(Phase::Resample);
         self.register(&scan);
         on_phase(Phase::Register);
-        let best = self.best().node;
-        self.output.add_scan(scan.outline);
-        self.output.follow(&mut self.tree, best);
-        if report.resampled {
-            let leaves = self.particles.iter().map(|p| p.node);
-            self.output.forget_scans_before(&self.tree, leaves);
-        }
+        self.update_output(scan, report.resampled);
         on_phase(Phase::Map);
         ScanUpdate::Processed(report)
     }
 
-    fn begin(&mut self, odom_from_base: Pose2) -> ScanReport {
+    /// The scan made ready, if it is to be processed.
+    fn admit(&mut self, reading: &ScanReading<'_>) -> Result<PreparedScan, SkipReason> {
+        self.scans_seen += 1;
+        if self.add_odometry(reading.odom_from_base) == OdometryUpdate::NotUsable {
+            return Err(SkipReason::BadOdometry);
+        }
+        if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans.max(1)) {
+            return Err(SkipReason::Throttled);
+        }
+        let elapsed = self.stamps.last().map(|last| reading.scan.stamp.seconds_since(*last));
+        if !self.parameters.gate.opens(&self.odometry.since_processed, elapsed) {
+            return Err(SkipReason::NotMovedEnough);
+        }
+        let scan = PreparedScan::new(reading, &self.parameters);
+        if scan.hits.is_empty() { Err(SkipReason::NoUsableBeams) } else { Ok(scan) }
+    }
+
+    /// All particles start alike; without an initial pose, `map` is `odom` at the first scan.
+    fn begin(&mut self, odom_from_base: Pose2) {
         let pose = self.parameters.initial_pose.unwrap_or(odom_from_base);
+        let count = self.parameters.particles.max(1);
         let root = self.tree.append(None, pose);
-        (1..self.parameters.particles).for_each(|_| self.tree.hold(root));
-        self.particles = (0..self.parameters.particles)
-            .map(|_| Particle {
-                pose_in_map: pose,
-                log_weight: 0.0,
-                total_log_weight: 0.0,
-                node: root,
-                field: TileMap::new(),
-                covariance: Matrix3::zeros(),
-                matched: true,
-            })
-            .collect();
-        ScanReport {
-            effective_sample_size: self.parameters.particles as f64,
-            resampled: false,
-            matched: self.parameters.particles,
-        }
+        self.particles = vec![Particle::new(pose, root); count];
+        (1..count).for_each(|_| self.tree.hold(root));
     }
 
-    fn match_particles(&mut self, scan: &PreparedScan, motion: &Motion) {
-        let step = self.stamps.len() as u64;
+    fn match_particles(&mut self, scan: &PreparedScan, motion: Motion) {
+        let step = Step {
+            scan,
+            motion,
+            noise: self.parameters.motion_noise,
+            weight_gain: self.parameters.weighting.gain(self.particles.len(), scan.hits.len()),
+            minimum_score: self.parameters.matcher.minimum_score,
+            number: self.stamps.len() as u64,
+        };
         let (matcher, streams) = (&self.matcher, &self.streams);
-        let noise = &self.parameters.motion_noise;
-        let weighting = self.parameters.weighting;
-        let [sx, sy, st] = noise.standard_deviations(motion);
-        for_each(self.pool.as_ref(), &mut self.particles, |i, particle| {
-            let ms = weighting.motion_scale;
-            let predicted = particle.pose_in_map * motion.increment;
-            let heading = particle.pose_in_map.theta;
-            let (sin, cos) = libm::sincos(heading);
-            let r = nalgebra::Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
-            let d = nalgebra::Vector3::new(
-                1.0 / (sx * sx + 1e-8),
-                1.0 / (sy * sy + 1e-8),
-                1.0 / (st * st + 1e-8),
-            );
-            let prior = if weighting.prior > 0.0 {
-                r * Matrix3::from_diagonal(&d) * r.transpose() * weighting.prior
-            } else {
-                Matrix3::zeros()
-            };
-            let start = if ms > 0.0 {
-                let mut gaussian = streams.gaussian(Purpose::Motion, step, i);
-                let scaled = Motion {
-                    forward: motion.forward * ms * ms,
-                    sideways: motion.sideways * ms * ms,
-                    turned: motion.turned * ms * ms,
-                    ..*motion
-                };
-                particle.pose_in_map * motion_model::sample(&scaled, noise, &mut gaussian)
-            } else {
-                predicted
-            };
-            let found = matcher.run(&particle.field, &scan.points, start, &prior);
-            let mut pose = found.pose_in_map;
-            if weighting.proposal > 0.0 {
-                let mut g = streams.gaussian(Purpose::Proposal, step, i);
-                let c = found.covariance;
-                if c[(2, 2)] > 0.0 {
-                    let turn = g.draw() * weighting.proposal * c[(2, 2)].sqrt();
-                    let k = weighting.conditional * turn / c[(2, 2)];
-                    pose = Pose2::new(pose.x + k * c[(0, 2)], pose.y + k * c[(1, 2)], pose::wrap_angle(pose.theta + turn));
-                }
-            }
-            particle.pose_in_map = pose;
-            particle.covariance = found.covariance;
-            particle.matched = found.accepted;
-            let beams = if weighting.per_beam { 180.0 / scan.points.all.len() as f64 } else { 1.0 };
-            particle.log_weight += found.log_likelihood * beams;
-            particle.total_log_weight += found.log_likelihood * beams;
+        for_each(self.pool.as_ref(), &mut self.particles, |index, particle| {
+            particle.advance(matcher, &step, streams, index);
         });
+        for particle in &mut self.particles {
+            let node = self.tree.append(Some(particle.node), particle.pose_in_map);
+            self.tree.release(std::mem::replace(&mut particle.node, node));
+        }
     }
 
-    fn resample(&mut self) -> ScanReport {
-        let n = self.particles.len();
-        let log_weights: Vec<f64> = self.particles.iter().map(|p| p.log_weight).collect();
-        let weights =
-            resampling::normalize(&log_weights, self.parameters.weighting.log_weight_gain(n));
+    /// Draws the particles anew if too few of them carry the weight.
+    fn resample(&mut self, hits: usize) -> ScanReport {
+        let weights = self.weights();
         let effective_sample_size = resampling::effective_sample_size(&weights);
-        let resampled =
-            effective_sample_size < self.parameters.weighting.resample_threshold * n as f64;
-        let before: Vec<NodeId> = self.particles.iter().map(|p| p.node).collect();
-        if resampled {
-            let uniform = self.streams.uniform(Purpose::Resampling, self.stamps.len() as u64, 0);
+        let threshold = self.parameters.weighting.resample_threshold * weights.len() as f64;
+        let report = ScanReport {
+            hits,
+            matched: self.particles.iter().filter(|particle| particle.matched).count(),
+            best_score: self.best().map_or(0.0, |particle| particle.score),
+            effective_sample_size,
+            entropy: resampling::entropy(&weights),
+            resampled: effective_sample_size < threshold,
+        };
+        if report.resampled {
+            let number = self.stamps.len() as u64;
+            let uniform = self.streams.uniform(Purpose::Resampling, number, 0);
             let ancestors = resampling::systematic(&weights, uniform);
-            self.particles = ancestors
-                .into_iter()
-                .map(|ancestor| Particle { log_weight: 0.0, ..self.particles[ancestor].clone() })
-                .collect();
+            let before = std::mem::take(&mut self.particles);
+            for ancestor in ancestors {
+                let particle = before[ancestor].clone();
+                self.tree.hold(particle.node);
+                self.particles.push(Particle { log_weight: 0.0, ..particle });
+            }
+            before.into_iter().for_each(|particle| self.tree.release(particle.node));
         }
-        for particle in &mut self.particles {
-            particle.node = self.tree.append(Some(particle.node), particle.pose_in_map);
-        }
-        before.into_iter().for_each(|node| self.tree.release(node));
-        let matched = self.particles.iter().filter(|p| p.matched).count();
-        ScanReport { effective_sample_size, resampled, matched }
+        report
     }
 
     fn register(&mut self, scan: &PreparedScan) {
-        let (kernel, resolution) = (&self.kernel, self.parameters.resolution);
+        let matcher = &self.matcher;
         for_each(self.pool.as_ref(), &mut self.particles, |_, particle| {
-            let pose = particle.pose_in_map;
-            let origin = Cell::containing(pose.position(), resolution);
-            let x = pose.x / resolution - f64::from(origin.ix);
-            let y = pose.y / resolution - f64::from(origin.iy);
-            let (sin, cos) = libm::sincos(pose.theta);
-            for (px, py) in scan.surface.iter() {
-                let (px, py) = (f64::from(px), f64::from(py));
-                kernel.stamp(
-                    &mut particle.field,
-                    origin,
-                    x + cos * px - sin * py,
-                    y + sin * px + cos * py,
-                );
-            }
+            matcher.register(particle, scan);
         });
     }
 
-    fn best(&self) -> &Particle {
-        let mut particles = self.particles.iter();
-        let first = particles.next().expect("there is at least one particle");
-        particles.fold(
-            first,
-            |best, p| if p.total_log_weight > best.total_log_weight { p } else { best },
-        )
+    fn update_output(&mut self, scan: PreparedScan, resampled: bool) {
+        let Some(best) = self.best().map(|particle| particle.node) else { return };
+        self.output.extend(&mut self.tree, best, scan.outline);
+        if resampled {
+            let leaves = self.particles.iter().map(|particle| particle.node);
+            self.output.forget_agreed(&self.tree, leaves);
+        }
     }
 
-    /// experiment
-    pub fn conflict(&self) -> (f64, usize) {
-        let (mut a, mut b, mut occ) = (0.0, 0.0, 0);
-        for (_, t) in self.output.map.counts().tiles() { for c in t { a += f64::from(c.hits.min(c.visits - c.hits)); b += f64::from(c.hits); occ += usize::from(c.hits as f64 > 0.25 * c.visits as f64); } }
-        (a / b, occ)
+    /// The particle with the largest weight since the start; the first of equals.
+    #[must_use]
+    pub fn best(&self) -> Option<&Particle> {
+        self.particles.iter().reduce(|best, particle| {
+            if particle.total_log_weight > best.total_log_weight { particle } else { best }
+        })
     }
 
-    /// Particles.
+    /// The particles; none before the first scan.
+    #[must_use]
     pub fn particles(&self) -> &[Particle] {
         &self.particles
     }
 
-    /// Tiles of the particles' fields.
-    pub fn tile_counts(&self) -> super::grid::tile_map::TileCounts {
-        super::grid::tile_map::TileCounts::of(self.particles.iter().map(|p| &p.field))
+    /// The particles' weights, in their order; they sum to one.
+    #[must_use]
+    pub fn weights(&self) -> Vec<f64> {
+        let log_weights: Vec<f64> = self.particles.iter().map(|p| p.log_weight).collect();
+        resampling::normalize(&log_weights)
     }
 
-    /// The best particle's pose of the base in `map` at its last processed scan, with odometry since.
+    /// The best particle's pose of the base in `map` at its last processed scan, with odometry
+    /// since; the initial pose before the first scan.
     #[must_use]
     pub fn pose_in_map(&self) -> Pose2 {
-        self.best().pose_in_map * self.since_processed.increment
+        let initial = self.parameters.initial_pose.unwrap_or_default();
+        let processed = self.best().map_or(initial, |particle| particle.pose_in_map);
+        processed * self.odometry.since_processed.increment
+    }
+
+    /// What takes odometry poses to the map: the best particle's correction at its last processed
+    /// scan. The identity before the first scan, as in slam_gmapping.
+    #[must_use]
+    pub fn map_from_odom(&self) -> Pose2 {
+        match (self.best(), self.odometry.odom_from_base) {
+            (Some(_), Some(odom_from_base)) => self.pose_in_map() * odom_from_base.inverse(),
+            _ => Pose2::IDENTITY,
+        }
+    }
+
+    /// The weighted covariance of the particles' poses about the best one: m², m rad, rad².
+    #[must_use]
+    pub fn cloud_covariance(&self) -> Matrix3<f64> {
+        let Some(best) = self.best() else { return Matrix3::zeros() };
+        let mean = best.pose_in_map;
+        let weighted = self.particles.iter().zip(self.weights());
+        weighted.fold(Matrix3::zeros(), |sum, (particle, weight)| {
+            let Pose2 { x, y, theta } = particle.pose_in_map;
+            let error =
+                nalgebra::Vector3::new(x - mean.x, y - mean.y, wrap_angle(theta - mean.theta));
+            sum + weight * error * error.transpose()
+        })
     }
 
     /// The pose of each processed scan as the best particle sees it now, oldest first.
     #[must_use]
     pub fn path(&self) -> Vec<(Stamp, Pose2)> {
-        if self.particles.is_empty() {
-            return Vec::new();
-        }
-        let mut poses: Vec<Pose2> =
-            self.tree.ancestry(self.best().node).map(|n| self.tree.pose(n)).collect();
-        poses.reverse();
-        self.stamps.iter().copied().zip(poses).collect()
+        let Some(best) = self.best() else { return Vec::new() };
+        let poses: Vec<Pose2> =
+            self.tree.ancestry(best.node).map(|node| self.tree.pose(node)).collect();
+        self.stamps.iter().copied().zip(poses.into_iter().rev()).collect()
+    }
+
+    /// Hits and visits of each cell, along the best particle's trajectory.
+    #[must_use]
+    pub const fn occupancy(&self) -> &OccupancyMap {
+        self.output.map()
     }
 
     /// The map of the best particle, cropped to what is known; `None` before the first scan.
     #[must_use]
     pub fn occupancy_grid(&self) -> Option<OccupancyGrid> {
-        self.output.map.to_grid(self.parameters.map.occupied_threshold)
+        self.output.map().to_grid(self.parameters.map.occupied_threshold)
+    }
+
+    /// The tiles of the particles' maps.
+    #[must_use]
+    pub fn particle_tiles(&self) -> TileCounts {
+        match self.matcher {
+            ScanMatcher::Field(_) => TileCounts::of(self.particles.iter().map(|p| &p.map.field)),
+            ScanMatcher::Compat(_) => TileCounts::of(self.particles.iter().map(|p| &p.map.hits)),
+        }
+    }
+
+    /// Nodes of the trajectory tree.
+    #[must_use]
+    pub fn trajectory_nodes(&self) -> usize {
+        self.tree.len()
     }
 }
 
@@ -613,179 +397,12 @@ fn for_each(
     particles: &mut [Particle],
     work: impl Fn(usize, &mut Particle) + Sync,
 ) {
-    use rayon::prelude::*;
-    match pool {
-        Some(pool) => pool.install(|| {
-            particles.par_iter_mut().with_min_len(4).enumerate().for_each(|(i, p)| work(i, p));
-        }),
-        None => particles.iter_mut().enumerate().for_each(|(i, p)| work(i, p)),
-    }
-}
-
-/// One hypothesis.
-#[derive(Debug, Clone)]
-pub struct Particle {
-    /// The base at the last processed scan.
-    pub pose_in_map: Pose2,
-    /// Since the last resampling.
-    log_weight: f64,
-    total_log_weight: f64,
-    node: NodeId,
-    field: TileMap<u8>,
-    /// Of the last match.
-    pub covariance: Matrix3<f64>,
-    matched: bool,
-}
-
-/// A scan made ready.
-#[derive(Debug)]
-struct PreparedScan {
-    points: MatchPoints,
-    surface: Points,
-    outline: ScanOutline,
-}
-
-impl PreparedScan {
-    fn new(reading: &ScanReading<'_>, parameters: &Parameters) -> Self {
-        let geometry = &reading.scan.geometry;
-        let limit = 16_000.0 * parameters.resolution;
-        let max_range = parameters.max_range.unwrap_or(f64::INFINITY);
-        let usable =
-            parameters.max_usable_range.unwrap_or(geometry.range_max()).min(max_range).min(limit);
-        let mut hits = Vec::new();
-        let mut ends = Vec::new();
-        for (i, range) in reading.scan.ranges.iter().enumerate() {
-            let angle = geometry.angle(i);
-            let (range, kind) = match geometry.classify(*range) {
-                Beam::Hit(range) if range <= usable => (range, BeamEndKind::Hit),
-                Beam::Hit(range) if range <= max_range => (usable, BeamEndKind::Free),
-                Beam::NoReturn if parameters.map.free_on_no_return => (usable, BeamEndKind::Free),
-                _ => (0.0, BeamEndKind::Nothing),
-            };
-            let point = reading.mount.point_in_base(angle, range);
-            if kind == BeamEndKind::Hit {
-                hits.push((
-                    (point.x / parameters.resolution) as f32,
-                    (point.y / parameters.resolution) as f32,
-                ));
-            }
-            ends.push(BeamEnd { point: [point.x as f32, point.y as f32], kind });
-        }
-        let all: Points = hits.into_iter().step_by(parameters.matcher.beam_skip + 1).collect();
-        let coarse = all.every(parameters.matcher.coarse_step);
-        let mut surface: Vec<(f32, f32)> = Vec::new();
-        let gap = parameters.matcher.gap / parameters.resolution;
-        let mut before: Option<(f64, f64)> = None;
-        let inc = geometry.angle_increment().abs();
-        for e in &ends {
-            let now = (e.kind == BeamEndKind::Hit).then(|| {
-                (
-                    f64::from(e.point[0]) / parameters.resolution,
-                    f64::from(e.point[1]) / parameters.resolution,
-                )
-            });
-            if let (Some(a), Some(b)) = (before, now) {
-                let d = ((a.0 - b.0).powi(2) + (a.1 - b.1).powi(2)).sqrt();
-                let r = (a.0 * a.0 + a.1 * a.1).sqrt().min((b.0 * b.0 + b.1 * b.1).sqrt());
-                if d > parameters.matcher.spacing
-                    && d < gap
-                    && d < parameters.matcher.incidence * r * inc
-                {
-                    let k = (d / parameters.matcher.spacing).ceil();
-                    for i in 1..k as usize {
-                        let f = i as f64 / k;
-                        surface
-                            .push(((a.0 + f * (b.0 - a.0)) as f32, (a.1 + f * (b.1 - a.1)) as f32));
-                    }
-                }
-            }
-            if let Some(b) = now {
-                surface.push((b.0 as f32, b.1 as f32));
-            }
-            before = now;
-        }
-        let surface: Points = surface.into_iter().collect();
-        let radius = all.iter().map(|(x, y)| x.hypot(y)).fold(0.0, f32::max) as i32 + 1;
-        let sensor = reading.mount.base_from_laser.position();
-        Self {
-            points: MatchPoints { all, coarse, radius },
-            surface,
-            outline: ScanOutline {
-                sensor,
-                ends,
-                angle_increment: geometry.angle_increment().abs(),
-            },
-        }
-    }
-}
-
-/// The occupancy map of one trajectory, moved from trajectory to trajectory by what differs.
-#[derive(Debug)]
-struct OutputMap {
-    map: OccupancyMap,
-    node: Option<NodeId>,
-    /// Scans that living particles may place differently; the first has number `first_scan`.
-    scans: VecDeque<ScanOutline>,
-    first_scan: u32,
-}
-
-impl OutputMap {
-    fn new(resolution: f64) -> Self {
-        Self {
-            map: OccupancyMap::new(resolution),
-            node: None,
-            scans: VecDeque::new(),
-            first_scan: 0,
-        }
-    }
-
-    fn add_scan(&mut self, scan: ScanOutline) {
-        self.scans.push_back(scan);
-    }
-
-    fn follow(&mut self, tree: &mut TrajectoryTree, node: NodeId) {
-        let shared = self.node.and_then(|old| tree.common_ancestor(old, node));
-        if let Some(old) = self.node {
-            for id in tree.ancestry(old).take_while(|id| Some(*id) != shared) {
-                let scan = &self.scans[(tree.depth(id) - self.first_scan) as usize];
-                self.map.remove(scan, tree.pose(id));
-            }
-        }
-        for id in tree.ancestry(node).take_while(|id| Some(*id) != shared) {
-            let scan = &self.scans[(tree.depth(id) - self.first_scan) as usize];
-            self.map.add(scan, tree.pose(id));
-        }
-        tree.hold(node);
-        if let Some(old) = self.node.replace(node) {
-            tree.release(old);
-        }
-    }
-
-    fn forget_scans_before(&mut self, tree: &TrajectoryTree, leaves: impl Iterator<Item = NodeId>) {
-        let mut shared = self.node;
-        for leaf in leaves {
-            shared = shared.and_then(|shared| tree.common_ancestor(shared, leaf));
-        }
-        if let Some(shared) = shared {
-            while self.first_scan <= tree.depth(shared) {
-                self.scans.pop_front();
-                self.first_scan += 1;
-            }
-        }
-    }
-}
-
-/// A map as `nav_msgs/OccupancyGrid` means it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct OccupancyGrid {
-    /// Metres a cell.
-    pub resolution: f64,
-    /// Cells a row.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
-    /// The lower-left corner of cell (0, 0) in `map`, m.
-    pub origin: super::pose::Point2,
-    /// Row by row from the lowest y: -1 unknown, 0 free, 100 occupied.
-    pub cells: Vec<i8>,
+    let Some(pool) = pool else {
+        particles.iter_mut().enumerate().for_each(|(index, particle)| work(index, particle));
+        return;
+    };
+    pool.install(|| {
+        let particles = particles.par_iter_mut().with_min_len(PARTICLES_A_TASK).enumerate();
+        particles.for_each(|(index, particle)| work(index, particle));
+    });
 }

@@ -3,39 +3,93 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::super::grid::Cell;
-use super::super::grid::likelihood_field::{Linearization, Points, Window, WindowPose};
+use super::super::grid::likelihood_field::{Kernel, Linearization, Points, Window, WindowPose};
 use super::super::grid::tile_map::TileMap;
 use super::super::pose::{Pose2, wrap_angle};
-use super::MatcherParameters;
+use super::prepared_scan::PreparedScan;
 
-/// Cells a match may move from where it began; the window is that much larger than the scan.
+/// Cells a match may move along an axis; the window is that much larger than the scan.
 const REACH: f64 = 40.0;
+/// Beams looked at by the climb: every second.
+const COARSE_STEP: usize = 2;
+/// Headings tried around the start before the climb, each way, and the angle between them, rad.
+const SWEEP: (i32, f64) = (4, 0.1);
+/// Step lengths of the climb, each half the one before.
 const CLIMB_LEVELS: u32 = 2;
+const POLISH_STEPS: u32 = 5;
+/// Longest Gauss-Newton step: cells and radians.
+const STEP_LIMIT: (f64, f64) = (2.0, 0.1);
+/// Steps below this end the polish: cells and radians.
+const CONVERGED: (f64, f64) = (0.01, 0.0002);
+/// The share of beams that are expected to end on what the map knows (Thrun, Burgard, Fox:
+/// Probabilistic Robotics, table 6.3, z_hit).
+const HIT_SHARE: f64 = 0.9;
+/// Beams with at least this field value take part in the estimate of the residual's variance.
+const MATCHED: u8 = 40;
+
+/// The scan matcher's settings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MatcherParameters {
+    /// Which matcher runs.
+    pub kind: MatcherKind,
+    /// `lstep`, m: first step of the hill climb.
+    pub linear_step: f64,
+    /// `astep`, rad: first step of the hill climb.
+    pub angular_step: f64,
+    /// `lskip`: this many beams are passed over between two that are matched.
+    pub beam_skip: usize,
+    /// `minimumScore`: a match counts only if its score is above this.
+    pub minimum_score: f64,
+    /// Standard deviation of the likelihood field around each hit, m.
+    pub field_sigma: f64,
+    /// `iterations`: how often the compat matcher halves its steps.
+    pub iterations: u32,
+    /// `sigma`: the compat matcher's score is exp(-d² / sigma), m².
+    pub sigma: f64,
+    /// `kernelSize`, cells: the compat matcher looks this far around an endpoint.
+    pub kernel_size: u32,
+    /// `lsigma`: the compat matcher's log likelihood of a beam is -d² / lsigma, m².
+    pub likelihood_sigma: f64,
+}
+
+impl Default for MatcherParameters {
+    fn default() -> Self {
+        Self {
+            kind: MatcherKind::Field,
+            linear_step: 0.05,
+            angular_step: 0.05,
+            beam_skip: 0,
+            minimum_score: 0.0,
+            field_sigma: 0.04,
+            iterations: 5,
+            sigma: 0.05,
+            kernel_size: 1,
+            likelihood_sigma: 0.075,
+        }
+    }
+}
+
+/// Which scan matcher runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MatcherKind {
+    /// A cached likelihood field, a coarse climb and a Gauss-Newton polish.
+    Field,
+    /// The original's objective and schedule: slow, and the reference for tests.
+    Compat,
+}
 
 /// The outcome of matching one scan against one map.
 #[derive(Debug, Clone, Copy)]
 pub struct Match {
     /// The base in `map`.
     pub pose_in_map: Pose2,
-    /// Inverse of the information matrix at the pose: m², m rad, rad²; x and y along map axes.
+    /// Uncertainty of the pose: m², m rad, rad²; x and y along the map's axes. Zero where the
+    /// matcher knows none: the compat matcher, or a scan that fits nowhere.
     pub covariance: Matrix3<f64>,
     /// ln p(z | x, m) up to a constant.
     pub log_likelihood: f64,
-    /// How well the beams fit: 1 a beam that ends exactly on a hit, 0 one that ends far from any.
+    /// Sum over beams: near 1 for a beam that ends on a hit, 0 for one that ends far from any.
     pub score: f64,
-    /// `score` is above `minimumScore`.
-    pub accepted: bool,
-}
-
-/// The scan as the matcher wants it: hits in the base frame, in cells.
-#[derive(Debug, Clone, Default)]
-pub struct MatchPoints {
-    /// Every usable hit.
-    pub all: Points,
-    /// The part of them that the climb looks at.
-    pub coarse: Points,
-    /// Distance from the base of the furthest, cells.
-    pub radius: i32,
 }
 
 /// Matches scans with a likelihood field: a coarse climb, then a Gauss-Newton polish.
@@ -43,6 +97,7 @@ pub struct MatchPoints {
 pub struct FieldMatcher {
     parameters: MatcherParameters,
     resolution: f64,
+    kernel: Kernel,
     log_likelihoods: [f64; 256],
 }
 
@@ -50,170 +105,169 @@ impl FieldMatcher {
     /// A matcher for fields of cells of `resolution` metres.
     #[must_use]
     pub fn new(parameters: MatcherParameters, resolution: f64) -> Self {
-        let p = &parameters;
-        let log_likelihoods = std::array::from_fn(|byte| {
-            let closeness = byte as f64 / 255.0;
-            // closeness = exp(-d²/2s²)
-            let d2 = -2.0 * p.field_sigma * p.field_sigma * libm::log(closeness.max(1e-6));
-            match p.likelihood {
-                2 => libm::log(p.hit_fraction * closeness + 1.0 - p.hit_fraction),
-                0 => {
-                    if d2.sqrt() < p.cut {
-                        -d2 / p.likelihood_sigma
-                    } else {
-                        -0.5 / p.likelihood_sigma
-                    }
-                }
-                _ => libm::log(
-                    p.hit_fraction * libm::exp(-d2 / (2.0 * p.like_sigma * p.like_sigma)) + 1.0
-                        - p.hit_fraction,
-                ),
-            }
-        });
-        Self { parameters, resolution, log_likelihoods }
+        let log_likelihood = |byte: usize| {
+            let hit = byte as f64 / 255.0;
+            libm::log(HIT_SHARE * hit + (1.0 - HIT_SHARE))
+        };
+        Self {
+            parameters,
+            resolution,
+            kernel: Kernel::new(parameters.field_sigma / resolution),
+            log_likelihoods: std::array::from_fn(log_likelihood),
+        }
     }
 
-    /// Matches `points` against `field`, starting from `start` (the base in `map`).
+    /// Matches a scan against `field`, starting with the base at `start`.
     #[must_use]
-    pub fn run(
-        &self,
-        field: &TileMap<u8>,
-        points: &MatchPoints,
-        start: Pose2,
-        prior: &Matrix3<f64>,
-    ) -> Match {
+    pub fn run(&self, field: &TileMap<u8>, scan: &PreparedScan, start: Pose2) -> Match {
         let centre = Cell::containing(start.position(), self.resolution);
-        let window = Window::around(field, centre, points.radius + REACH as i32 + 2);
+        let window = Window::around(field, centre, scan.radius + REACH as i32 + 2);
         let first = window.first_cell();
         let origin = WindowPose::new(
             start.x / self.resolution - f64::from(first.ix),
             start.y / self.resolution - f64::from(first.iy),
             start.theta,
         );
-        let climbed = self.climb(&window, &points.coarse, origin);
-        let scale = Matrix3::from_diagonal(&Vector3::new(self.resolution, self.resolution, 1.0));
-        let prior = scale * prior * scale;
-        let (pose, fit) = self.polish(&window, &points.all, climbed, origin, &prior);
-        let mut log_likelihood = 0.0;
-        let (mut rs, mut rn) = (0.0, 0.0);
-        window.for_each_value(&points.all, pose, |value| {
-            log_likelihood += self.log_likelihoods[usize::from(value)];
-            if value > 40 { rn += 1.0; let e = 1.0 - f64::from(value) / 255.0; rs += e * e; }
-        });
-        let score = points.all.len() as f64 - f64::from(fit.cost);
-        let residual: f64 = if self.parameters.robust { (rs / f64::max(rn, 1.0)).max(1e-3) } else { (f64::from(fit.cost) / points.all.len() as f64).max(1e-3) };
-        let information = information(&fit) / residual + prior;
-        let covariance = scale * information.try_inverse().unwrap_or_else(Matrix3::zeros) * scale;
+        let climbed = self.climb(&window, &scan.hits.every(COARSE_STEP), origin);
+        let (pose, fit) = polish(&window, &scan.hits, climbed, origin);
+        let Evidence { log_likelihood, residual_variance } = self.evidence(&window, scan, pose);
         Match {
             pose_in_map: Pose2::new(
                 start.x + (pose.x - origin.x) * self.resolution,
                 start.y + (pose.y - origin.y) * self.resolution,
                 wrap_angle(pose.theta),
             ),
-            covariance,
+            covariance: self.covariance(&fit, residual_variance),
             log_likelihood,
-            score,
-            accepted: score > self.parameters.minimum_score,
+            score: scan.hits.len() as f64 - f64::from(fit.cost),
         }
     }
 
-    /// Hill climbing along the map's axes and the heading, as the original does it.
+    /// Enters a scan taken with the base at `pose` into `field`.
+    pub fn register(&self, field: &mut TileMap<u8>, scan: &PreparedScan, pose: Pose2) {
+        let origin = Cell::containing(pose.position(), self.resolution);
+        let x = pose.x / self.resolution - f64::from(origin.ix);
+        let y = pose.y / self.resolution - f64::from(origin.iy);
+        let (sin, cos) = libm::sincos(pose.theta);
+        let hits = scan.surfaces.iter().map(|(px, py)| {
+            let (px, py) = (f64::from(px), f64::from(py));
+            [x + cos * px - sin * py, y + sin * px + cos * py]
+        });
+        self.kernel.insert(field, origin, hits);
+    }
+
+    /// A sweep of headings, then hill climbing along the map's axes and the heading.
     fn climb(&self, window: &Window<'_>, points: &Points, origin: WindowPose) -> WindowPose {
+        let mut best = (window.score(points, origin), origin);
+        let (each_way, angle) = SWEEP;
+        let headings = (-each_way..=each_way).filter(|i| *i != 0);
+        let sweep = headings.map(|i| origin.turned(f64::from(i) * angle));
+        best = better(window, points, best, sweep);
         let mut step = self.parameters.linear_step / self.resolution;
         let mut turn = self.parameters.angular_step;
-        let mut best = origin;
-        let mut best_score = window.score(points, best);
-        let mut level = 0;
-        let start = best;
-        for i in 1..=self.parameters.sweep {
-            for sign in [-1.0, 1.0] {
-                let pose = start.turned(sign * f64::from(i) * self.parameters.sweep_step);
-                let score = window.score(points, pose);
-                if f64::from(score) > self.parameters.sweep_bias * f64::from(best_score) {
-                    (best, best_score) = (pose, score);
+        for _ in 0..CLIMB_LEVELS {
+            loop {
+                let from = best.1;
+                let moves = [
+                    from.moved(step, 0.0),
+                    from.moved(-step, 0.0),
+                    from.moved(0.0, step),
+                    from.moved(0.0, -step),
+                    from.turned(turn),
+                    from.turned(-turn),
+                ];
+                let within = moves.into_iter().filter(|pose| within_reach(*pose, origin));
+                let found = better(window, points, best, within);
+                if found.0 == best.0 {
+                    break;
                 }
+                best = found;
             }
+            step *= 0.5;
+            turn *= 0.5;
         }
-        while level < self.parameters.climb_levels {
-            let moves = [
-                best.moved(step, 0.0),
-                best.moved(-step, 0.0),
-                best.moved(0.0, step),
-                best.moved(0.0, -step),
-                best.turned(turn),
-                best.turned(-turn),
-            ];
-            let before = best_score;
-            for pose in moves {
-                let score = window.score(points, pose);
-                if score > best_score && within_reach(pose, origin) {
-                    (best, best_score) = (pose, score);
-                }
-            }
-            if best_score == before {
-                step *= 0.5;
-                turn *= 0.5;
-                level += 1;
-            }
-        }
-        best
+        best.1
     }
 
-    /// Damped Gauss-Newton on the interpolated field; a step counts only if the fit improves.
-    fn polish(
-        &self,
-        window: &Window<'_>,
-        points: &Points,
-        start: WindowPose,
-        origin: WindowPose,
-        prior: &Matrix3<f64>,
-    ) -> (WindowPose, Linearization) {
-        let mut pose = start;
-        let mut fit = window.linearize(points, pose);
-        let offset =
-            |p: WindowPose| Vector3::new(p.x - origin.x, p.y - origin.y, p.theta - origin.theta);
-        let residual = 0.2;
-        let total = |p: WindowPose, f: &Linearization| {
-            let d = offset(p);
-            f64::from(f.cost) / residual + (d.transpose() * prior * d)[0]
-        };
-        let mut cost = total(pose, &fit);
-        for _ in 0..self.parameters.polish_steps {
-            let mut information = information(&fit) / residual + prior;
-            for i in 0..3 {
-                information[(i, i)] *= 1.0 + self.parameters.damping;
-                information[(i, i)] += 1e-6;
+    fn evidence(&self, window: &Window<'_>, scan: &PreparedScan, pose: WindowPose) -> Evidence {
+        let mut log_likelihood = 0.0;
+        let (mut squares, mut matched) = (0.0, 0.0);
+        window.for_each_value(&scan.hits, pose, |value| {
+            log_likelihood += self.log_likelihoods[usize::from(value)];
+            if value >= MATCHED {
+                let residual = 1.0 - f64::from(value) / 255.0;
+                squares += residual * residual;
+                matched += 1.0;
             }
-            let gradient =
-                Vector3::from(fit.gradient.map(f64::from)) / residual - prior * offset(pose);
-            let Some(inverse) = information.try_inverse() else { break };
-            let step = inverse * gradient;
-            let limit = 2.0_f64;
-            let shrink = (limit / step.xy().norm()).min(0.1 / step[2].abs()).min(1.0);
-            let step = step * shrink;
-            let next = WindowPose::new(pose.x + step[0], pose.y + step[1], pose.theta + step[2]);
-            if !within_reach(next, origin) {
-                break;
-            }
-            let next_fit = window.linearize(points, next);
-            let next_cost = total(next, &next_fit);
-            if next_cost >= cost {
-                break;
-            }
-            (pose, fit, cost) = (next, next_fit, next_cost);
-            if step.xy().norm() < 0.01 && step[2].abs() < 0.0002 {
-                break;
-            }
-        }
-        (pose, fit)
+        });
+        Evidence { log_likelihood, residual_variance: squares / f64::max(matched, 1.0) }
+    }
+
+    /// The residuals' variance times the inverse of the information, in metres and radians.
+    fn covariance(&self, fit: &Linearization, residual_variance: f64) -> Matrix3<f64> {
+        let scale = Matrix3::from_diagonal(&Vector3::new(self.resolution, self.resolution, 1.0));
+        let inverse = information(fit).try_inverse().unwrap_or_else(Matrix3::zeros);
+        scale * inverse * scale * residual_variance
     }
 }
 
-fn within_reach(pose: WindowPose, origin: WindowPose) -> bool {
-    (pose.x - origin.x).abs() <= REACH && (pose.y - origin.y).abs() <= REACH
+/// What a scan says at the pose it was matched to.
+struct Evidence {
+    log_likelihood: f64,
+    /// Mean square of 1 - m over the beams that end near something known.
+    residual_variance: f64,
+}
+
+/// The best of a scored pose and some others; the first of equals.
+fn better(
+    window: &Window<'_>,
+    points: &Points,
+    best: (u32, WindowPose),
+    poses: impl Iterator<Item = WindowPose>,
+) -> (u32, WindowPose) {
+    poses
+        .map(|pose| (window.score(points, pose), pose))
+        .fold(best, |best, other| if other.0 > best.0 { other } else { best })
+}
+
+/// Gauss-Newton on the interpolated field; a step counts only if the fit improves.
+fn polish(
+    window: &Window<'_>,
+    points: &Points,
+    start: WindowPose,
+    origin: WindowPose,
+) -> (WindowPose, Linearization) {
+    let (mut pose, mut fit) = (start, window.linearize(points, start));
+    for _ in 0..POLISH_STEPS {
+        let Some(step) = gauss_newton_step(&fit) else { break };
+        let next = WindowPose::new(pose.x + step[0], pose.y + step[1], pose.theta + step[2]);
+        if !within_reach(next, origin) {
+            break;
+        }
+        let next_fit = window.linearize(points, next);
+        if next_fit.cost >= fit.cost {
+            break;
+        }
+        (pose, fit) = (next, next_fit);
+        if step.xy().norm() < CONVERGED.0 && step[2].abs() < CONVERGED.1 {
+            break;
+        }
+    }
+    (pose, fit)
+}
+
+/// H⁻¹ Jᵀe, shortened to the step limit; `None` where the field is flat in some direction.
+fn gauss_newton_step(fit: &Linearization) -> Option<Vector3<f64>> {
+    let step = information(fit).try_inverse()? * Vector3::from(fit.gradient.map(f64::from));
+    let excess = (step.xy().norm() / STEP_LIMIT.0).max(step[2].abs() / STEP_LIMIT.1).max(1.0);
+    excess.is_finite().then(|| step / excess)
 }
 
 fn information(fit: &Linearization) -> Matrix3<f64> {
     let [xx, xy, xt, yy, yt, tt] = fit.information.map(f64::from);
     Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, tt)
+}
+
+fn within_reach(pose: WindowPose, origin: WindowPose) -> bool {
+    (pose.x - origin.x).abs() <= REACH && (pose.y - origin.y).abs() <= REACH
 }

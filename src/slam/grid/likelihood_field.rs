@@ -5,19 +5,21 @@
 //! the maximum, so that a beam is evaluated with one look-up where the original searched nine
 //! cells and their means.
 
-use std::num::Wrapping;
-
-use super::Cell;
 use super::tile_map::{TILE_CELLS, TILE_SIZE, Tile, TileKey, TileMap, index_in_tile};
+use super::{Cell, floor};
 
 /// Sub-cell positions a kernel is tabulated for, along each axis.
 const PHASES: usize = 8;
+/// A hit in a cell with at least this value is taken for known.
+const KNOWN: u8 = 240;
 /// Beams whose cells are computed together before they are looked up.
 const BLOCK: usize = 64;
 /// Lanes of the floating-point sums; fixed, so that sums are the same on every machine.
 const LANES: usize = 8;
 /// Adding this to a float in (-2^22, 2^22) leaves its nearest integer in the low mantissa bits.
 const ROUND: f32 = 12_582_912.0;
+/// The bits of a column or row that say where in its tile it is.
+const CELL: u32 = TILE_SIZE as u32 - 1;
 const EMPTY: &Tile<u8> = &[0; TILE_CELLS];
 
 /// Points of a scan in the base frame, in cells, kept apart by axis for vector instructions.
@@ -166,7 +168,6 @@ impl<'a> Window<'a> {
     /// Tile and cell of a column and a row, which may carry other bits above the window's.
     #[inline(always)]
     fn index(&self, column: u32, row: u32) -> u32 {
-        const CELL: u32 = TILE_SIZE as u32 - 1;
         let tile_column = (column >> 5) & ((1 << self.width_shift) - 1);
         let tile_row = (row >> 5) & 0x1_ffff;
         (((tile_row << self.width_shift) | tile_column) << 10)
@@ -185,13 +186,13 @@ impl<'a> Window<'a> {
     fn values_around(&self, column: u32, row: u32) -> [u8; 4] {
         let index = self.index(column, row);
         let inner = index as usize & (TILE_CELLS - 1);
-        if column & 31 < 31 && row & 31 < 31 {
+        if column & CELL < CELL && row & CELL < CELL {
             let tile = self.tiles.get((index >> 10) as usize).copied().unwrap_or(EMPTY);
             let upper = (inner + TILE_SIZE).min(TILE_CELLS - 2);
             [tile[inner], tile[inner + 1], tile[upper], tile[upper + 1]]
         } else {
-            let (right, above) = (Wrapping(column) + Wrapping(1), Wrapping(row) + Wrapping(1));
-            [(column, row), (right.0, row), (column, above.0), (right.0, above.0)]
+            let (right, above) = (column.wrapping_add(1), row.wrapping_add(1));
+            [(column, row), (right, row), (column, above), (right, above)]
                 .map(|(column, row)| self.value(self.index(column, row)))
         }
     }
@@ -207,8 +208,9 @@ impl<'a> Window<'a> {
         // after taking half a cell away is rounding down.
         let (x0, y0) = ((pose.x - 1.0) as f32, (pose.y - 1.0) as f32);
         let mut sums = Sums::default();
+        let mut block = Block::default();
         for (xs, ys) in points.x.chunks(BLOCK).zip(points.y.chunks(BLOCK)) {
-            let mut block = Block::default();
+            block.corners.iter_mut().for_each(|corner| corner[xs.len()..].fill(0.0));
             for (i, (x, y)) in xs.iter().zip(ys).enumerate() {
                 let (dx, dy) = (cos * x - sin * y, sin * x + cos * y);
                 let (column, row) = (dx + x0 + ROUND, dy + y0 + ROUND);
@@ -306,61 +308,100 @@ pub struct Kernel {
     radius: i32,
     /// Rows of `2 * radius + 1` bytes, bottom first, for each phase.
     stamps: Vec<Vec<u8>>,
-    /// A hit in a cell at least this near to an earlier one changes nothing.
-    known: u8,
+}
+
+/// A hit to stamp: its cell, and where in the cell it lies.
+#[derive(Debug, Clone, Copy)]
+struct Stamp {
+    hit: Cell,
+    phase: usize,
 }
 
 impl Kernel {
     /// A kernel of standard deviation `sigma`, in cells.
     #[must_use]
-    pub fn new(sigma: f64, known: u8, tail: f64, tail_sigma: f64) -> Self {
-        let radius = libm::ceil(if tail > 0.0 { 2.5 * tail_sigma } else { 3.0 * sigma }) as i32;
+    pub fn new(sigma: f64) -> Self {
+        let radius = floor(3.0 * sigma) + 1;
         let phase = |p: usize| (p as f64 + 0.5) / PHASES as f64;
         let stamps = (0..PHASES * PHASES).map(|p| {
             let (hit_x, hit_y) = (phase(p % PHASES), phase(p / PHASES));
             let side = -radius..=radius;
-            side.clone()
-                .flat_map(|dy| {
-                    side.clone().map(move |dx| (f64::from(dx) + 0.5, f64::from(dy) + 0.5))
-                })
-                .map(|(x, y)| {
-                    let squared = (x - hit_x) * (x - hit_x) + (y - hit_y) * (y - hit_y);
-                    libm::round(255.0 * ((1.0 - tail) * libm::exp(-0.5 * squared / (sigma * sigma)) + tail * libm::exp(-0.5 * squared / (tail_sigma * tail_sigma)))) as u8
-                })
-                .collect()
+            let centres = side.clone().flat_map(|dy| {
+                side.clone().map(move |dx| (f64::from(dx) + 0.5, f64::from(dy) + 0.5))
+            });
+            let value = |(x, y)| {
+                let squared = (x - hit_x) * (x - hit_x) + (y - hit_y) * (y - hit_y);
+                libm::round(255.0 * libm::exp(-0.5 * squared / (sigma * sigma))) as u8
+            };
+            centres.map(value).collect()
         });
-        Self { radius, stamps: stamps.collect(), known }
+        Self { radius, stamps: stamps.collect() }
     }
 
-    /// Enters a hit at (x, y), in cells from the corner of `origin`.
-    pub fn stamp(&self, field: &mut TileMap<u8>, origin: Cell, x: f64, y: f64) {
-        let (column, row) = (libm::floor(x), libm::floor(y));
-        let hit = Cell::new(origin.ix + column as i32, origin.iy + row as i32);
-        if field.get(hit) >= self.known {
-            return;
+    /// Enters hits at (x, y), in cells from the lower-left corner of `origin`.
+    ///
+    /// Hits in cells that already are near a hit change nothing, and copy no tile.
+    pub fn insert(
+        &self,
+        field: &mut TileMap<u8>,
+        origin: Cell,
+        hits: impl Iterator<Item = [f64; 2]>,
+    ) {
+        let stamps = unknown(field, origin, hits);
+        let mut by_tile = Vec::with_capacity(2 * stamps.len());
+        for stamp in &stamps {
+            let corner = |sign| {
+                let reach = sign * self.radius;
+                TileKey::containing(Cell::new(stamp.hit.ix + reach, stamp.hit.iy + reach))
+            };
+            let (first, last) = (corner(-1), corner(1));
+            for ty in first.ty..=last.ty {
+                by_tile.extend((first.tx..=last.tx).map(|tx| (TileKey { ty, tx }, *stamp)));
+            }
         }
-        let phase = |fraction: f64| ((fraction * PHASES as f64) as usize).min(PHASES - 1);
-        let stamp = &self.stamps[phase(y - row) * PHASES + phase(x - column)];
-        let side = 2 * self.radius + 1;
-        let (left, bottom) = (hit.ix - self.radius, hit.iy - self.radius);
-        let size = TILE_SIZE as i32;
-        for tile_y in
-            (bottom.div_euclid(size)..=(bottom + side - 1).div_euclid(size)).map(|t| t * size)
-        {
-            for tile_x in
-                (left.div_euclid(size)..=(left + side - 1).div_euclid(size)).map(|t| t * size)
-            {
-                let tile = field.tile_mut(TileKey::containing(Cell::new(tile_x, tile_y)));
-                let columns = left.max(tile_x)..(left + side).min(tile_x + size);
-                for iy in bottom.max(tile_y)..(bottom + side).min(tile_y + size) {
-                    let from = ((iy - bottom) * side + columns.start - left) as usize;
-                    let to = index_in_tile(Cell::new(columns.start, iy));
-                    let cells = &mut tile[to..to + columns.len()];
-                    for (cell, value) in cells.iter_mut().zip(&stamp[from..]) {
-                        *cell = (*cell).max(*value);
-                    }
-                }
+        by_tile.sort_by_key(|(key, _)| *key);
+        for group in by_tile.chunk_by(|a, b| a.0 == b.0) {
+            let key = group[0].0;
+            let tile = field.tile_mut(key);
+            for (_, stamp) in group {
+                self.stamp(tile, key.first_cell(), *stamp);
             }
         }
     }
+
+    /// Raises the cells of one tile to the stamp's values.
+    fn stamp(&self, tile: &mut Tile<u8>, first: Cell, Stamp { hit, phase }: Stamp) {
+        let (size, side) = (TILE_SIZE as i32, 2 * self.radius + 1);
+        let (left, bottom) = (hit.ix - self.radius - first.ix, hit.iy - self.radius - first.iy);
+        let (start, end) = (left.max(0), (left + side).min(size));
+        for row in bottom.max(0)..(bottom + side).min(size) {
+            let from = ((row - bottom) * side + start - left) as usize;
+            let to = (row * size) as usize;
+            let cells = &mut tile[to + start as usize..to + end as usize];
+            for (cell, value) in cells.iter_mut().zip(&self.stamps[phase][from..]) {
+                *cell = (*cell).max(*value);
+            }
+        }
+    }
+}
+
+/// The hits in cells that are not yet near a hit.
+fn unknown(field: &TileMap<u8>, origin: Cell, hits: impl Iterator<Item = [f64; 2]>) -> Vec<Stamp> {
+    let mut tile = (TileKey::containing(origin), field.tile(TileKey::containing(origin)));
+    let mut stamps = Vec::new();
+    for [x, y] in hits {
+        let (column, row) = (floor(x), floor(y));
+        let hit = Cell::new(origin.ix + column, origin.iy + row);
+        let key = TileKey::containing(hit);
+        if tile.0 != key {
+            tile = (key, field.tile(key));
+        }
+        if tile.1.is_some_and(|tile| tile[index_in_tile(hit)] >= KNOWN) {
+            continue;
+        }
+        let phase = |fraction: f64| ((fraction * PHASES as f64) as usize).min(PHASES - 1);
+        let phase = phase(y - f64::from(row)) * PHASES + phase(x - f64::from(column));
+        stamps.push(Stamp { hit, phase });
+    }
+    stamps
 }

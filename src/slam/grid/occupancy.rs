@@ -3,9 +3,12 @@
 //! A scan counts each cell once, and an obstacle beats free space within a scan. Counts are sums
 //! over scans, so a scan that turns out to lie elsewhere can be taken out again, exactly.
 
+use std::f64::consts::TAU;
+use std::iter::Peekable;
+
 use super::super::pose::{Point2, Pose2};
-use super::Cell;
 use super::tile_map::{TILE_SIZE, TileKey, TileMap, index_in_tile};
+use super::{Cell, floor};
 
 /// Neighbouring beams further apart than this say nothing about what lies between them, rad.
 const WIDEST_WEDGE: f64 = 0.6;
@@ -50,6 +53,21 @@ pub struct ScanOutline {
     pub angle_increment: f64,
 }
 
+/// A map as `nav_msgs/OccupancyGrid` means it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OccupancyGrid {
+    /// Metres a cell.
+    pub resolution: f64,
+    /// Cells a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The lower-left corner of cell (0, 0) in `map`, m.
+    pub origin: Point2,
+    /// Row by row from the lowest y: -1 unknown, 0 free, 100 occupied.
+    pub cells: Vec<i8>,
+}
+
 /// Counts of hits and visits over the plane, for cells of one size.
 #[derive(Debug, Clone)]
 pub struct OccupancyMap {
@@ -58,56 +76,23 @@ pub struct OccupancyMap {
     scratch: Scratch,
 }
 
-impl OccupancyMap {
-    /// The grid of -1 unknown, 0 free, 100 occupied, cropped to the seen cells.
-    pub fn to_grid(&self, threshold: f64) -> Option<crate::slam::gmapping::OccupancyGrid> {
-        let seen = self.counts.tiles().flat_map(|(key, tile)| {
-            tile.iter().enumerate().filter(|(_, c)| c.visits > 0).map(move |(i, _)| {
-                let first = key.first_cell();
-                Cell::new(first.ix + (i % TILE_SIZE) as i32, first.iy + (i / TILE_SIZE) as i32)
-            })
-        });
-        let (mut low, mut high) = (Cell::new(i32::MAX, i32::MAX), Cell::new(i32::MIN, i32::MIN));
-        for c in seen {
-            low = Cell::new(low.ix.min(c.ix), low.iy.min(c.iy));
-            high = Cell::new(high.ix.max(c.ix), high.iy.max(c.iy));
-        }
-        if low.ix > high.ix {
-            return None;
-        }
-        let (width, height) = ((high.ix - low.ix + 1) as usize, (high.iy - low.iy + 1) as usize);
-        let mut cells = vec![-1; width * height];
-        for (key, tile) in self.counts.tiles() {
-            let first = key.first_cell();
-            for (i, c) in tile.iter().enumerate().filter(|(_, c)| c.visits > 0) {
-                let (x, y) = (
-                    first.ix + (i % TILE_SIZE) as i32 - low.ix,
-                    first.iy + (i / TILE_SIZE) as i32 - low.iy,
-                );
-                cells[y as usize * width + x as usize] =
-                    if f64::from(c.hits) > threshold * f64::from(c.visits) { 100 } else { 0 };
-            }
-        }
-        Some(crate::slam::gmapping::OccupancyGrid {
-            resolution: self.resolution,
-            width,
-            height,
-            origin: Point2::new(
-                f64::from(low.ix) * self.resolution,
-                f64::from(low.iy) * self.resolution,
-            ),
-            cells,
-        })
-    }
-}
-
 /// Buffers that keep their memory from scan to scan.
 #[derive(Debug, Clone, Default)]
 struct Scratch {
     corners: Vec<Point2>,
-    rows: Vec<Vec<(f64, i32)>>,
+    rows: Vec<Vec<Crossing>>,
     hits: Vec<Cell>,
-    spans: Vec<Span>,
+    /// Free cells of a row of tiles, by column of tiles.
+    columns: Vec<Vec<Span>>,
+}
+
+/// Where an edge of the free polygon crosses the middle of a row of cells.
+#[derive(Debug, Clone, Copy)]
+struct Crossing {
+    /// In cells.
+    x: f64,
+    /// 1 for an edge that goes up, -1 for one that goes down.
+    direction: i32,
 }
 
 /// Cells of one row from `start` up to `end`, not included.
@@ -116,6 +101,13 @@ struct Span {
     iy: i32,
     start: i32,
     end: i32,
+}
+
+/// Whether a scan is entered or taken out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Change {
+    Add,
+    Remove,
 }
 
 impl OccupancyMap {
@@ -133,47 +125,75 @@ impl OccupancyMap {
 
     /// Enters a scan taken with the base at `map_from_base`.
     pub fn add(&mut self, scan: &ScanOutline, map_from_base: Pose2) {
-        self.count(scan, map_from_base, |count, hit| {
-            count.visits += 1;
-            count.hits += u32::from(hit);
-        });
+        self.count(scan, map_from_base, Change::Add);
     }
 
     /// Takes a scan out again that was entered with the same pose.
     pub fn remove(&mut self, scan: &ScanOutline, map_from_base: Pose2) {
-        self.count(scan, map_from_base, |count, hit| {
-            count.visits -= 1;
-            count.hits -= u32::from(hit);
+        self.count(scan, map_from_base, Change::Remove);
+    }
+
+    fn count(&mut self, scan: &ScanOutline, map_from_base: Pose2, change: Change) {
+        // Wrapping makes taking out the same loop as entering, with -1 in place of 1.
+        let one = match change {
+            Change::Add => 1,
+            Change::Remove => u32::MAX,
+        };
+        self.scratch.outline(scan, map_from_base, self.resolution);
+        for cell in &self.scratch.hits {
+            let count = self.counts.get_mut(*cell);
+            count.hits = count.hits.wrapping_add(one);
+            count.visits = count.visits.wrapping_add(one);
+        }
+        let counts = &mut self.counts;
+        self.scratch.fill(|key, spans| {
+            let tile = counts.tile_mut(key);
+            for span in spans {
+                let index = index_in_tile(Cell::new(span.start, span.iy));
+                for count in &mut tile[index..index + (span.end - span.start) as usize] {
+                    count.visits = count.visits.wrapping_add(one);
+                }
+            }
         });
     }
 
-    /// Calls `change` once for each cell the scan saw, and whether a beam ended in it.
-    fn count(
-        &mut self,
-        scan: &ScanOutline,
-        map_from_base: Pose2,
-        change: impl Fn(&mut Count, bool),
-    ) {
-        let mut scratch = std::mem::take(&mut self.scratch);
-        scratch.outline(scan, map_from_base, self.resolution);
-        scratch.fill();
-        for span in &scratch.spans {
-            let mut start = span.start;
-            while start < span.end {
-                let first = Cell::new(start, span.iy);
-                let tile = self.counts.tile_mut(TileKey::containing(first));
-                let index = index_in_tile(first);
-                let length = (TILE_SIZE - index % TILE_SIZE).min((span.end - start) as usize);
-                for count in &mut tile[index..index + length] {
-                    change(count, false);
-                }
-                start += length as i32;
-            }
+    /// The map as it is handed out, cropped to the cells that were seen; `None` if there are none.
+    ///
+    /// A cell is occupied if its share of hits is above `occupied_threshold`.
+    #[must_use]
+    pub fn to_grid(&self, occupied_threshold: f64) -> Option<OccupancyGrid> {
+        let (low, high) = self.bounds()?;
+        let (width, height) = ((high.ix - low.ix + 1) as usize, (high.iy - low.iy + 1) as usize);
+        let mut cells = vec![-1; width * height];
+        for (cell, count) in self.seen() {
+            let index = (cell.iy - low.iy) as usize * width + (cell.ix - low.ix) as usize;
+            let occupied = f64::from(count.hits) > occupied_threshold * f64::from(count.visits);
+            cells[index] = if occupied { 100 } else { 0 };
         }
-        for cell in &scratch.hits {
-            change(self.counts.get_mut(*cell), true);
-        }
-        self.scratch = scratch;
+        let corner = |i: i32| f64::from(i) * self.resolution;
+        let origin = Point2::new(corner(low.ix), corner(low.iy));
+        Some(OccupancyGrid { resolution: self.resolution, width, height, origin, cells })
+    }
+
+    fn seen(&self) -> impl Iterator<Item = (Cell, Count)> {
+        self.counts.tiles().flat_map(|(key, tile)| {
+            let first = key.first_cell();
+            let size = TILE_SIZE as i32;
+            (0..).zip(tile).filter(|(_, count)| count.visits > 0).map(move |(i, count)| {
+                (Cell::new(first.ix + i % size, first.iy + i / size), *count)
+            })
+        })
+    }
+
+    fn bounds(&self) -> Option<(Cell, Cell)> {
+        let mut cells = self.seen().map(|(cell, _)| cell);
+        let first = cells.next()?;
+        Some(cells.fold((first, first), |(low, high), cell| {
+            (
+                Cell::new(low.ix.min(cell.ix), low.iy.min(cell.iy)),
+                Cell::new(high.ix.max(cell.ix), high.iy.max(cell.iy)),
+            )
+        }))
     }
 }
 
@@ -201,66 +221,86 @@ impl Scratch {
         if scan.angle_increment > WIDEST_WEDGE {
             return;
         }
-        let closes = (scan.ends.len() as f64 + 0.5) * scan.angle_increment >= std::f64::consts::TAU;
+        let closes = (scan.ends.len() as f64 + 0.5) * scan.angle_increment >= TAU;
         let around = scan.ends.last().filter(|_| closes).into_iter();
-        let mut previous: Option<(Point2, f64)> = None;
+        let mut previous = None;
         for beam in around.chain(&scan.ends) {
-            let current = (beam.kind != BeamEndKind::Nothing).then(|| {
-                let arm = {
-                    let p = end(beam);
-                    Point2::new(p.x - sensor.x, p.y - sensor.y)
-                };
-                (arm, arm.norm())
-            });
-            if let (Some(a), Some(b)) = (previous, current) {
-                let reach = a.1.min(b.1);
-                for (arm, length) in [a, b] {
-                    let share = reach / length;
-                    self.corners
-                        .push(Point2::new(sensor.x + share * arm.x, sensor.y + share * arm.y));
-                }
-            } else {
-                self.corners.push(sensor);
+            let current = (beam.kind != BeamEndKind::Nothing).then(|| Arm::new(sensor, end(beam)));
+            match previous.zip(current) {
+                Some((a, b)) => self.corners.extend(Arm::wedge(sensor, a, b)),
+                None => self.corners.push(sensor),
             }
             previous = current;
         }
     }
 
-    /// The spans of cells whose centres lie inside the polygon, without those that were hit.
-    fn fill(&mut self) {
-        self.spans.clear();
-        let rows = self.corners.iter().map(|c| c.y);
-        let bottom = libm::floor(rows.clone().fold(f64::INFINITY, f64::min)) as i32;
-        let top = libm::ceil(rows.fold(f64::NEG_INFINITY, f64::max)) as i32;
+    /// Calls `take` with the free cells of each tile: those whose centres lie inside the polygon
+    /// and in which no beam ends.
+    fn fill(&mut self, mut take: impl FnMut(TileKey, &[Span])) {
+        let (low, high) = bounds(&self.corners);
+        let (bottom, top) = (floor(low.y), floor(high.y) + 1);
         let height = (top - bottom) as usize;
-        self.rows.iter_mut().take(height).for_each(Vec::clear);
         self.rows.resize_with(self.rows.len().max(height), Vec::new);
         let next = self.corners.iter().cycle().skip(1);
         for (a, b) in self.corners.iter().zip(next) {
             cross_rows(&mut self.rows, bottom, *a, *b);
         }
-        let mut hits = self.hits.iter().peekable();
-        for (row, crossings) in self.rows[..height].iter_mut().enumerate() {
-            let iy = bottom + row as i32;
-            crossings.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-            let mut winding = 0;
-            let mut from = 0.0;
-            for (x, direction) in crossings {
-                if winding == 0 {
-                    from = *x;
-                }
-                winding += *direction;
-                if winding == 0 {
-                    let span = Span { iy, start: first_centre(from), end: first_centre(*x) };
-                    push_without_hits(&mut self.spans, span, &mut hits);
+        let tile_of = |x: f64| TileKey::containing(Cell::new(floor(x), 0)).tx;
+        let (left, right) = (tile_of(low.x), tile_of(high.x));
+        self.columns.resize_with(self.columns.len().max((right - left + 1) as usize), Vec::new);
+        let mut hits = self.hits.iter().copied().peekable();
+        for (iy, crossings) in (bottom..top).zip(&mut self.rows) {
+            crossings.sort_unstable_by(|a, b| a.x.total_cmp(&b.x));
+            for_each_inside(crossings, |start, end| {
+                push_without_hits(&mut self.columns, left, Span { iy, start, end }, &mut hits);
+            });
+            crossings.clear();
+            if iy + 1 == top || index_in_tile(Cell::new(0, iy + 1)) == 0 {
+                let ty = TileKey::containing(Cell::new(0, iy)).ty;
+                for (tx, spans) in (left..=right).zip(&mut self.columns) {
+                    if !spans.is_empty() {
+                        take(TileKey { ty, tx }, spans);
+                        spans.clear();
+                    }
                 }
             }
         }
     }
 }
 
+/// From the sensor to the end of a beam, in cells.
+#[derive(Debug, Clone, Copy)]
+struct Arm {
+    direction: Point2,
+    length: f64,
+}
+
+impl Arm {
+    fn new(sensor: Point2, end: Point2) -> Self {
+        let direction = Point2::new(end.x - sensor.x, end.y - sensor.y);
+        Self { direction, length: direction.norm() }
+    }
+
+    /// The outer corners of the triangle that two neighbouring beams know to be free: as long as
+    /// the shorter of them, since nothing is known behind an edge that only one has passed.
+    fn wedge(sensor: Point2, a: Self, b: Self) -> [Point2; 2] {
+        let reach = a.length.min(b.length);
+        [a, b].map(|arm| {
+            let share = if arm.length > 0.0 { reach / arm.length } else { 0.0 };
+            Point2::new(sensor.x + share * arm.direction.x, sensor.y + share * arm.direction.y)
+        })
+    }
+}
+
+fn bounds(points: &[Point2]) -> (Point2, Point2) {
+    let first = (points[0], points[0]);
+    points.iter().fold(first, |(low, high), p| {
+        (Point2::new(low.x.min(p.x), low.y.min(p.y)), Point2::new(high.x.max(p.x), high.y.max(p.y)))
+    })
+}
+
 /// Notes where the edge from `a` to `b` crosses the middles of rows, and which way.
-fn cross_rows(rows: &mut [Vec<(f64, i32)>], bottom: i32, a: Point2, b: Point2) {
+fn cross_rows(rows: &mut [Vec<Crossing>], bottom: i32, a: Point2, b: Point2) {
     let (low, high, direction) = if a.y < b.y { (a, b, 1) } else { (b, a, -1) };
     let (start, end) = (first_centre(low.y), first_centre(high.y));
     if start >= end {
@@ -269,26 +309,55 @@ fn cross_rows(rows: &mut [Vec<(f64, i32)>], bottom: i32, a: Point2, b: Point2) {
     let slope = (high.x - low.x) / (high.y - low.y);
     for iy in start..end {
         let x = low.x + slope * (f64::from(iy) + 0.5 - low.y);
-        rows[(iy - bottom) as usize].push((x, direction));
+        rows[(iy - bottom) as usize].push(Crossing { x, direction });
     }
 }
 
 /// The first cell whose centre is not before `x`.
 fn first_centre(x: f64) -> i32 {
-    libm::ceil(x - 0.5) as i32
+    -floor(0.5 - x)
 }
 
-/// Adds the parts of `span` between the hits of its row; `hits` come in the order of the spans.
-fn push_without_hits<'a>(
-    spans: &mut Vec<Span>,
+/// Calls `take` with the first and one past the last cell of each stretch inside the polygon, by
+/// the non-zero winding rule: beams that overlap after a full turn do not cancel each other.
+fn for_each_inside(crossings: &[Crossing], mut take: impl FnMut(i32, i32)) {
+    let mut winding = 0;
+    let mut from = 0.0;
+    for crossing in crossings {
+        if winding == 0 {
+            from = crossing.x;
+        }
+        winding += crossing.direction;
+        if winding == 0 {
+            take(first_centre(from), first_centre(crossing.x));
+        }
+    }
+}
+
+/// Adds the parts of `span` between the hits of its row, tile by tile; hits come in the order of
+/// the spans.
+fn push_without_hits(
+    columns: &mut [Vec<Span>],
+    left: i32,
     mut span: Span,
-    hits: &mut std::iter::Peekable<impl Iterator<Item = &'a Cell>>,
+    hits: &mut Peekable<impl Iterator<Item = Cell>>,
 ) {
     while let Some(hit) = hits.next_if(|hit| (hit.iy, hit.ix) < (span.iy, span.end)) {
         if hit.iy == span.iy && hit.ix >= span.start {
-            spans.push(Span { end: hit.ix, ..span });
+            push_by_tile(columns, left, Span { end: hit.ix, ..span });
             span.start = hit.ix + 1;
         }
     }
-    spans.push(span);
+    push_by_tile(columns, left, span);
+}
+
+fn push_by_tile(columns: &mut [Vec<Span>], left: i32, span: Span) {
+    let size = TILE_SIZE as i32;
+    let mut start = span.start;
+    while start < span.end {
+        let tx = TileKey::containing(Cell::new(start, span.iy)).tx;
+        let end = span.end.min((tx + 1) * size);
+        columns[(tx - left) as usize].push(Span { iy: span.iy, start, end });
+        start = end;
+    }
 }

@@ -1,0 +1,111 @@
+//! Everything the filter can be told; what belongs to one part of it is described there.
+
+use super::super::motion_gate::MotionGate;
+use super::super::odometry::MotionNoise;
+use super::super::pose::Pose2;
+use super::resampling::Weighting;
+use super::scan_matcher::MatcherParameters;
+
+/// Odometry further from its origin than this is not a robot's, m.
+const FURTHEST: f64 = 1e7;
+
+/// The filter's parameters; the defaults are slam_gmapping's where it has them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameters {
+    /// Number of hypotheses, at least 1.
+    pub particles: usize,
+    /// `throttle_scans`: every n-th scan is looked at.
+    pub throttle_scans: usize,
+    /// `delta`: metres a cell.
+    pub resolution: f64,
+    /// `maxRange`, m: readings strictly above are discarded; `None` takes the sensor's own limit.
+    pub max_range: Option<f64>,
+    /// `maxUrange`, m: readings above are not matched, and free space ends there.
+    pub max_usable_range: Option<f64>,
+    /// Where the base is in `map` at the first scan; `None` makes `map` and `odom` coincide there.
+    pub initial_pose: Option<Pose2>,
+    /// Odometry noise.
+    pub motion_noise: MotionNoise,
+    /// Which scans are processed.
+    pub gate: MotionGate,
+    /// The guard against odometry jumps.
+    pub jump: JumpGuard,
+    /// Scan matching.
+    pub matcher: MatcherParameters,
+    /// Weights and resampling.
+    pub weighting: Weighting,
+    /// The map that is handed out.
+    pub map: MapParameters,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        Self {
+            particles: 30,
+            throttle_scans: 1,
+            resolution: 0.05,
+            max_range: None,
+            max_usable_range: None,
+            initial_pose: None,
+            motion_noise: MotionNoise::default(),
+            gate: MotionGate::default(),
+            jump: JumpGuard::default(),
+            matcher: MatcherParameters::default(),
+            weighting: Weighting::default(),
+            map: MapParameters::default(),
+        }
+    }
+}
+
+/// What happens when odometry moves further between two readings than a robot can.
+///
+/// The original prints a banner and believes the jump.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JumpGuard {
+    /// Metres between two successive odometry readings that count as a jump.
+    pub max_step: f64,
+    /// What then happens.
+    pub policy: JumpPolicy,
+}
+
+impl Default for JumpGuard {
+    fn default() -> Self {
+        Self { max_step: 20.0, policy: JumpPolicy::Reject }
+    }
+}
+
+impl JumpGuard {
+    /// Whether a step is to be taken out.
+    pub(super) fn rejects(&self, step: Pose2) -> bool {
+        self.policy == JumpPolicy::Reject && step.position().norm() > self.max_step
+    }
+
+    /// Whether a pose can be a robot's at all.
+    pub(super) fn is_usable(&self, odom_from_base: Pose2) -> bool {
+        odom_from_base.is_finite() && odom_from_base.position().norm() <= FURTHEST
+    }
+}
+
+/// What to do with a reading that jumped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum JumpPolicy {
+    /// The jump is taken out: the robot is believed not to have moved meanwhile.
+    Reject,
+    /// The jump is believed.
+    Continue,
+}
+
+/// The occupancy map that is handed out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MapParameters {
+    /// `occ_thresh`: a cell is occupied when hits / visits is above this.
+    pub occupied_threshold: f64,
+    /// Whether a beam without return marks free space out to `maxUrange`.
+    pub free_on_no_return: bool,
+}
+
+impl Default for MapParameters {
+    fn default() -> Self {
+        Self { occupied_threshold: 0.25, free_on_no_return: false }
+    }
+}
