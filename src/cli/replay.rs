@@ -68,7 +68,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let threads = arguments.threads.get();
     let watch = Stopwatch::start();
-    let outcome = replay(&log, Replay::new(&config, threads))?;
+    let outcome = replay(&log, Replay::new(&config, threads)?)?;
     let elapsed = watch.elapsed();
 
     let products = Products::of(&outcome);
