@@ -1,0 +1,80 @@
+//! The documents say what the code does: keys, defaults and files that they name.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use gmapd::config::RawConfig;
+use serde_json::Value;
+
+/// Documents whose file names must be there.
+const DOCUMENTS: [&str; 5] = [
+    "README.md",
+    "CHANGELOG.md",
+    "docs/architecture.md",
+    "docs/dependencies.md",
+    "docs/parameters.md",
+];
+
+/// Folders whose files the documents name.
+const FOLDERS: [&str; 6] = ["src/", "tests/", "docs/", "config/", "benches/", ".ci/"];
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn read(name: &str) -> String {
+    fs::read_to_string(root().join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+}
+
+/// The keys of the tables of `docs/parameters.md`, with the default beside each.
+fn documented() -> BTreeMap<String, String> {
+    let document = read("docs/parameters.md");
+    let rows = document.lines().filter_map(|line| line.strip_prefix("| `"));
+    let cells = rows.filter_map(|row| {
+        let mut cells = row.split('|').map(str::trim);
+        Some((cells.next()?.trim_end_matches('`').to_owned(), cells.next()?.to_owned()))
+    });
+    let mut documented = BTreeMap::new();
+    for (key, default) in cells {
+        let before = documented.insert(key.clone(), default);
+        assert!(before.is_none(), "docs/parameters.md has {key} twice");
+    }
+    documented
+}
+
+#[test]
+fn every_key_is_documented_with_its_default_and_no_other() {
+    let keys = serde_json::to_value(RawConfig::default()).expect("the configuration is JSON");
+    let Value::Object(keys) = keys else { panic!("the configuration is an object") };
+    let keys: BTreeMap<String, String> =
+        keys.into_iter().map(|(key, default)| (key, default.to_string())).collect();
+    assert_eq!(documented(), keys, "docs/parameters.md on the left, src/config/raw.rs right");
+}
+
+#[test]
+fn files_that_documents_name_are_there() {
+    let mut missing = Vec::new();
+    for name in DOCUMENTS {
+        for (index, line) in read(name).lines().enumerate() {
+            for path in paths(line).filter(|path| !root().join(path).exists()) {
+                missing.push(format!("{name}:{}: {path}", index + 1));
+            }
+        }
+    }
+    assert!(missing.is_empty(), "no such file:\n{}", missing.join("\n"));
+}
+
+/// Names of files of this project that a line has between backticks or as a link.
+fn paths(line: &str) -> impl Iterator<Item = &str> {
+    let words = line.split(['`', '(', ')', ' ', ',']);
+    words.filter(|word| {
+        FOLDERS.iter().any(|folder| word.starts_with(folder)) && !word.contains(['<', '*'])
+    })
+}
+
+#[test]
+fn the_architecture_fits_two_hundred_lines() {
+    let lines = read("docs/architecture.md").lines().count();
+    assert!(lines <= 200, "docs/architecture.md has {lines} lines");
+}
