@@ -42,7 +42,7 @@ impl Progress {
     pub(super) fn advance(&mut self, stamp: Stamp) {
         self.done += 1;
         self.last_stamp = self.last_stamp.max(stamp);
-        if self.done % STRIDE != 0 {
+        if !self.done.is_multiple_of(STRIDE) {
             return;
         }
         let wall = self.watch.elapsed().wall;
