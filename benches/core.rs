@@ -161,8 +161,7 @@ fn output_map_add_and_remove(bencher: Bencher<'_, '_>, beams: usize) {
 /// A whole processed scan on one thread.
 #[divan::bench(args = SIZES, sample_count = TIMED, sample_size = 1)]
 fn add_scan(bencher: Bencher<'_, '_>, size: Size) {
-    // One scan more than is timed: divan runs the first one twice.
-    let (mount, sweeps) = sweeps(size.beams, LEARNED + TIMED as usize + 1);
+    let (mount, sweeps) = sweeps(size.beams, LEARNED + TIMED as usize);
     let gate = MotionGate { linear_update: 0.0, ..MotionGate::default() };
     let parameters = Parameters { particles: size.particles, gate, ..Parameters::default() };
     let mut filter = GMapping::new(parameters, 1, 1).expect("no thread is started");

@@ -11,6 +11,7 @@ benches/runs/<date>, which must not be there yet. Needs nothing beyond Python's 
 import argparse
 import dataclasses
 import datetime
+import itertools
 import json
 import os
 import pathlib
@@ -47,13 +48,12 @@ def main():
     with tempfile.TemporaryDirectory() as scratch:
         scratch = pathlib.Path(scratch)
         logs = recorded_logs(arguments.data) + simulated_logs(gmapd, scratch)
-        particles, threads = (PARTICLES[:1], THREADS[:1]) if arguments.quick else (PARTICLES, THREADS)
+        sizes = (PARTICLES[:1], THREADS[:1]) if arguments.quick else (PARTICLES, THREADS)
         runs = []
         for log in logs:
-            for count in particles:
-                for number in threads:
-                    runs.append(measure(gmapd, log, count, number, scratch))
-                    tell(runs[-1])
+            for particles, threads in itertools.product(*sizes):
+                runs.append(measure(gmapd, log, particles, threads, scratch))
+                tell(runs[-1])
         instructions = count_instructions(gmapd, logs[0], scratch) if arguments.callgrind else None
     out.mkdir(parents=True)
     raw = {"date": date, "machine": machine(), "commit": commit(), "runs": runs,
@@ -256,6 +256,9 @@ def phase_row(measured):
 
 
 def same_results(runs):
+    threads = sorted({measured["threads"] for measured in runs})
+    if len(threads) == 1:
+        return "Not measured: all runs had the same number of threads."
     hashes = {}
     for measured in runs:
         key = (measured["log"], measured["particles"])
@@ -264,12 +267,13 @@ def same_results(runs):
                  if len(found) > 1]
     if differing:
         return "**Map or trajectory differ for " + ", ".join(differing) + ".**"
-    return f"Map and trajectory have one SHA-256 for every number of threads, in all {len(hashes)} cases."
+    numbers = " and ".join(map(str, threads))
+    return f"Map and trajectory have the same SHA-256 with {numbers} threads, in all {len(hashes)} cases."
 
 
 def table(head, rows):
-    numeric = ["---" if column == 0 else "---:" for column in range(len(head))]
-    lines = [head, numeric, *rows]
+    rule = ["---" if column == 0 else "---:" for column in range(len(head))]
+    lines = [head, rule, *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
 
 
