@@ -38,6 +38,12 @@ use super::scan::{LaserMount, Scan};
 /// Particles a thread takes at a time; fewer are not worth handing over.
 const PARTICLES_A_TASK: usize = 4;
 
+/// A particle must be this much likelier than the best one to take its place, in nats: four times.
+///
+/// Weights of nearly equal particles take turns at being the largest; without this the map and the
+/// pose would jump between them, and the output map would be rebuilt over and over.
+const CLEARLY_BETTER: f64 = 2.0 * std::f64::consts::LN_2;
+
 /// A scan with all that is needed to use it.
 #[derive(Debug, Clone, Copy)]
 pub struct ScanReading<'a> {
@@ -130,6 +136,8 @@ pub struct GMapping {
     matcher: ScanMatcher,
     /// Empty before the first scan.
     particles: Vec<Particle>,
+    /// Index of the particle whose map and trajectory are handed out.
+    best: usize,
     tree: TrajectoryTree,
     output: OutputMap,
     odometry: Odometry,
@@ -159,6 +167,7 @@ impl GMapping {
             pool: pool.map_err(|source| ThreadsError { threads, source })?,
             matcher: ScanMatcher::new(parameters.matcher, parameters.resolution),
             particles: Vec::new(),
+            best: 0,
             tree: TrajectoryTree::default(),
             output: OutputMap::new(parameters.resolution),
             odometry: Odometry::default(),
@@ -206,7 +215,10 @@ impl GMapping {
         on_phase(Phase::Resample);
         self.register(&scan);
         on_phase(Phase::Register);
-        self.update_output(scan, report.resampled);
+        self.update_output(scan);
+        if report.resampled {
+            self.output.forget_agreed(&self.tree, self.particles.iter().map(|p| p.node));
+        }
         on_phase(Phase::Map);
         ScanUpdate::Processed(report)
     }
@@ -258,6 +270,7 @@ impl GMapping {
 
     /// Draws the particles anew if too few of them carry the weight.
     fn resample(&mut self, hits: usize) -> ScanReport {
+        self.choose_best();
         let weights = self.weights();
         let effective_sample_size = resampling::effective_sample_size(&weights);
         let threshold = self.parameters.weighting.resample_threshold * weights.len() as f64;
@@ -274,12 +287,14 @@ impl GMapping {
             let uniform = self.streams.uniform(Purpose::Resampling, number, 0);
             let ancestors = resampling::systematic(&weights, uniform);
             let before = std::mem::take(&mut self.particles);
+            let survivor = ancestors.iter().position(|ancestor| *ancestor == self.best);
             for ancestor in ancestors {
                 let particle = before[ancestor].clone();
                 self.tree.hold(particle.node);
                 self.particles.push(Particle { log_weight: 0.0, ..particle });
             }
             before.into_iter().for_each(|particle| self.tree.release(particle.node));
+            self.best = survivor.unwrap_or_else(|| self.most_likely());
         }
         report
     }
@@ -291,21 +306,31 @@ impl GMapping {
         });
     }
 
-    fn update_output(&mut self, scan: PreparedScan, resampled: bool) {
+    fn update_output(&mut self, scan: PreparedScan) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
         self.output.extend(&mut self.tree, best, scan.outline);
-        if resampled {
-            let leaves = self.particles.iter().map(|particle| particle.node);
-            self.output.forget_agreed(&self.tree, leaves);
+    }
+
+    /// Index of the particle with the largest weight since the start; the first of equals.
+    fn most_likely(&self) -> usize {
+        let weight = |index: usize| self.particles[index].total_log_weight;
+        let better = |best, other| if weight(other) > weight(best) { other } else { best };
+        (0..self.particles.len()).reduce(better).unwrap_or(0)
+    }
+
+    fn choose_best(&mut self) {
+        let candidate = self.most_likely();
+        let weight = |index: usize| self.particles[index].total_log_weight;
+        if weight(candidate) > weight(self.best) + CLEARLY_BETTER {
+            self.best = candidate;
         }
     }
 
-    /// The particle with the largest weight since the start; the first of equals.
+    /// The particle whose map and trajectory are handed out: the most likely one, except that
+    /// another takes its place only when it is clearly better.
     #[must_use]
     pub fn best(&self) -> Option<&Particle> {
-        self.particles.iter().reduce(|best, particle| {
-            if particle.total_log_weight > best.total_log_weight { particle } else { best }
-        })
+        self.particles.get(self.best)
     }
 
     /// The particles; none before the first scan.

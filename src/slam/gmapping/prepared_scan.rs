@@ -13,7 +13,7 @@ const SURFACE_GAP: f64 = 2.0;
 /// ... and at most this many times as far as on a surface seen head-on.
 const SURFACE_SLANT: f64 = 15.0;
 /// Points of a surface that are nearer to each other than this add nothing, cells.
-const SURFACE_SPACING: f64 = 0.5;
+const SURFACE_SPACING: f64 = 0.8;
 
 /// What the filter needs of a scan.
 #[derive(Debug, Clone)]
@@ -94,7 +94,7 @@ fn surfaces(ends: &[Option<[f64; 2]>], widest: f64, slant: f64) -> Points {
             let gap = distance(before, hit);
             let range = distance(before, [0.0; 2]).min(distance(hit, [0.0; 2]));
             if gap < widest && gap < slant * range {
-                let pieces = gap.ceil();
+                let pieces = gap.round();
                 points.extend((1..pieces as i32).map(|i| {
                     let share = f64::from(i) / pieces;
                     [0, 1].map(|axis| before[axis] + share * (hit[axis] - before[axis]))

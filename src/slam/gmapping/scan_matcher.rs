@@ -20,7 +20,7 @@ const POLISH_STEPS: u32 = 5;
 /// Longest Gauss-Newton step: cells and radians.
 const STEP_LIMIT: (f64, f64) = (2.0, 0.1);
 /// Steps below this end the polish: cells and radians.
-const CONVERGED: (f64, f64) = (0.01, 0.0002);
+const CONVERGED: (f64, f64) = (0.02, 0.0004);
 /// The share of beams that are expected to end on what the map knows (Thrun, Burgard, Fox:
 /// Probabilistic Robotics, table 6.3, z_hit).
 const HIT_SHARE: f64 = 0.9;
@@ -148,12 +148,8 @@ impl FieldMatcher {
         let origin = Cell::containing(pose.position(), self.resolution);
         let x = pose.x / self.resolution - f64::from(origin.ix);
         let y = pose.y / self.resolution - f64::from(origin.iy);
-        let (sin, cos) = libm::sincos(pose.theta);
-        let hits = scan.surfaces.iter().map(|(px, py)| {
-            let (px, py) = (f64::from(px), f64::from(py));
-            [x + cos * px - sin * py, y + sin * px + cos * py]
-        });
-        self.kernel.insert(field, origin, hits);
+        let pose = WindowPose::new(x, y, pose.theta);
+        self.kernel.insert(field, origin, &scan.surfaces, pose);
     }
 
     /// A sweep of headings, then hill climbing along the map's axes and the heading.

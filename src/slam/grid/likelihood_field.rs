@@ -10,8 +10,8 @@ use super::{Cell, floor};
 
 /// Sub-cell positions a kernel is tabulated for, along each axis.
 const PHASES: usize = 8;
-/// A hit in a cell with at least this value is taken for known.
-const KNOWN: u8 = 240;
+/// A hit that would raise its cell by no more than this is taken for known.
+const KNOWN_WITHIN: u8 = 8;
 /// Beams whose cells are computed together before they are looked up.
 const BLOCK: usize = 64;
 /// Lanes of the floating-point sums; fixed, so that sums are the same on every machine.
@@ -306,8 +306,13 @@ impl Sums {
 #[derive(Debug, Clone)]
 pub struct Kernel {
     radius: i32,
-    /// Rows of `2 * radius + 1` bytes, bottom first, for each phase.
+    /// Bytes from one row of a stamp to the next.
+    stride: usize,
+    /// For each phase, rows of `2 * radius + 1` bytes, bottom first, each between zeros as wide
+    /// as a tile: however a stamp lies over a tile, each of its rows is as long as the tile's.
     stamps: Vec<Vec<u8>>,
+    /// For each phase, from which value on a cell has nothing to learn from a hit in it.
+    known: Vec<u8>,
 }
 
 /// A hit to stamp: its cell, and where in the cell it lies.
@@ -325,29 +330,28 @@ impl Kernel {
         let phase = |p: usize| (p as f64 + 0.5) / PHASES as f64;
         let stamps = (0..PHASES * PHASES).map(|p| {
             let (hit_x, hit_y) = (phase(p % PHASES), phase(p / PHASES));
-            let side = -radius..=radius;
-            let centres = side.clone().flat_map(|dy| {
-                side.clone().map(move |dx| (f64::from(dx) + 0.5, f64::from(dy) + 0.5))
-            });
-            let value = |(x, y)| {
-                let squared = (x - hit_x) * (x - hit_x) + (y - hit_y) * (y - hit_y);
-                libm::round(255.0 * libm::exp(-0.5 * squared / (sigma * sigma))) as u8
+            let value = |dx: i32, dy: i32| {
+                let (x, y) = (f64::from(dx) + 0.5 - hit_x, f64::from(dy) + 0.5 - hit_y);
+                libm::round(255.0 * libm::exp(-0.5 * (x * x + y * y) / (sigma * sigma))) as u8
             };
-            centres.map(value).collect()
+            let row = |dy| {
+                let values = (-radius..=radius).map(move |dx| value(dx, dy));
+                let zeros = [0; TILE_SIZE];
+                zeros.into_iter().chain(values).chain(zeros)
+            };
+            let stamp: Vec<u8> = (-radius..=radius).flat_map(row).collect();
+            (stamp, value(0, 0).saturating_sub(KNOWN_WITHIN))
         });
-        Self { radius, stamps: stamps.collect() }
+        let (stamps, known) = stamps.unzip();
+        let stride = 2 * TILE_SIZE + 2 * radius as usize + 1;
+        Self { radius, stride, stamps, known }
     }
 
-    /// Enters hits at (x, y), in cells from the lower-left corner of `origin`.
+    /// Enters hits seen from `pose`, which is relative to the lower-left corner of `origin`.
     ///
     /// Hits in cells that already are near a hit change nothing, and copy no tile.
-    pub fn insert(
-        &self,
-        field: &mut TileMap<u8>,
-        origin: Cell,
-        hits: impl Iterator<Item = [f64; 2]>,
-    ) {
-        let stamps = unknown(field, origin, hits);
+    pub fn insert(&self, field: &mut TileMap<u8>, origin: Cell, hits: &Points, pose: WindowPose) {
+        let stamps = self.unknown(field, origin, hits, pose);
         let mut by_tile = Vec::with_capacity(2 * stamps.len());
         for stamp in &stamps {
             let corner = |sign| {
@@ -359,7 +363,7 @@ impl Kernel {
                 by_tile.extend((first.tx..=last.tx).map(|tx| (TileKey { ty, tx }, *stamp)));
             }
         }
-        by_tile.sort_by_key(|(key, _)| *key);
+        by_tile.sort_unstable_by_key(|(key, _)| *key);
         for group in by_tile.chunk_by(|a, b| a.0 == b.0) {
             let key = group[0].0;
             let tile = field.tile_mut(key);
@@ -369,39 +373,77 @@ impl Kernel {
         }
     }
 
+    /// The hits that the field has something to learn from.
+    fn unknown(
+        &self,
+        field: &TileMap<u8>,
+        origin: Cell,
+        hits: &Points,
+        pose: WindowPose,
+    ) -> Vec<Stamp> {
+        let [cos, sin] = pose.rotation;
+        let (x0, y0) = ((pose.x - 0.5) as f32, (pose.y - 0.5) as f32);
+        let mut tile = (TileKey::containing(origin), field.tile(TileKey::containing(origin)));
+        let mut stamps = Vec::new();
+        let (mut x_in_cells, mut y_in_cells) = ([0.0; BLOCK], [0.0; BLOCK]);
+        let mut cells = [Cell::new(0, 0); BLOCK];
+        for (xs, ys) in hits.x.chunks(BLOCK).zip(hits.y.chunks(BLOCK)) {
+            for (i, (x, y)) in xs.iter().zip(ys).enumerate() {
+                x_in_cells[i] = cos * x - sin * y + x0;
+                y_in_cells[i] = sin * x + cos * y + y0;
+                cells[i].ix = nearest_integer(x_in_cells[i]);
+                cells[i].iy = nearest_integer(y_in_cells[i]);
+            }
+            for (i, cell) in cells[..xs.len()].iter().enumerate() {
+                let hit = Cell::new(origin.ix + cell.ix, origin.iy + cell.iy);
+                let key = TileKey::containing(hit);
+                if tile.0 != key {
+                    tile = (key, field.tile(key));
+                }
+                let column = phase(x_in_cells[i] - cell.ix as f32 + 0.5);
+                let row = phase(y_in_cells[i] - cell.iy as f32 + 0.5);
+                let phase = row * PHASES + column;
+                let value = tile.1.map_or(0, |tile| tile[index_in_tile(hit)]);
+                if value < self.known[phase] {
+                    stamps.push(Stamp { hit, phase });
+                }
+            }
+        }
+        stamps
+    }
+
     /// Raises the cells of one tile to the stamp's values.
     fn stamp(&self, tile: &mut Tile<u8>, first: Cell, Stamp { hit, phase }: Stamp) {
         let (size, side) = (TILE_SIZE as i32, 2 * self.radius + 1);
         let (left, bottom) = (hit.ix - self.radius - first.ix, hit.iy - self.radius - first.iy);
-        let (start, end) = (left.max(0), (left + side).min(size));
-        for row in bottom.max(0)..(bottom + side).min(size) {
-            let from = ((row - bottom) * side + start - left) as usize;
-            let to = (row * size) as usize;
-            let cells = &mut tile[to + start as usize..to + end as usize];
-            for (cell, value) in cells.iter_mut().zip(&self.stamps[phase][from..]) {
-                *cell = (*cell).max(*value);
+        let (start, end) = (bottom.max(0), (bottom + side).min(size));
+        let rows = &mut tile[start as usize * TILE_SIZE..end as usize * TILE_SIZE];
+        let stamp = &self.stamps[phase][(start - bottom) as usize * self.stride..];
+        let from = (size - left) as usize;
+        let (rows, _) = rows.as_chunks_mut::<TILE_SIZE>();
+        for (cells, values) in rows.iter_mut().zip(stamp.chunks_exact(self.stride)) {
+            if let Some(values) = values[from..].first_chunk::<TILE_SIZE>() {
+                raise(cells, values);
             }
         }
     }
 }
 
-/// The hits in cells that are not yet near a hit.
-fn unknown(field: &TileMap<u8>, origin: Cell, hits: impl Iterator<Item = [f64; 2]>) -> Vec<Stamp> {
-    let mut tile = (TileKey::containing(origin), field.tile(TileKey::containing(origin)));
-    let mut stamps = Vec::new();
-    for [x, y] in hits {
-        let (column, row) = (floor(x), floor(y));
-        let hit = Cell::new(origin.ix + column, origin.iy + row);
-        let key = TileKey::containing(hit);
-        if tile.0 != key {
-            tile = (key, field.tile(key));
-        }
-        if tile.1.is_some_and(|tile| tile[index_in_tile(hit)] >= KNOWN) {
-            continue;
-        }
-        let phase = |fraction: f64| ((fraction * PHASES as f64) as usize).min(PHASES - 1);
-        let phase = phase(y - f64::from(row)) * PHASES + phase(x - f64::from(column));
-        stamps.push(Stamp { hit, phase });
+/// Raises each cell to its new value. A call of its own, so that it becomes vector instructions.
+#[inline(never)]
+fn raise(cells: &mut [u8; TILE_SIZE], values: &[u8; TILE_SIZE]) {
+    for (cell, value) in cells.iter_mut().zip(values) {
+        *cell = (*cell).max(*value);
     }
-    stamps
+}
+
+/// The nearest integer to a float in (-2^22, 2^22), by instructions that every machine has.
+#[inline(always)]
+fn nearest_integer(value: f32) -> i32 {
+    (value + ROUND).to_bits().wrapping_sub(ROUND.to_bits()) as i32
+}
+
+/// Which of the tabulated positions within a cell a fraction of it is nearest to.
+fn phase(fraction: f32) -> usize {
+    ((fraction * PHASES as f32) as usize).min(PHASES - 1)
 }
