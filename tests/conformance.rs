@@ -292,7 +292,7 @@ fn assert_same_map(a: &Lidar, b: &Lidar) {
 }
 
 fn half_circle() -> Lidar {
-    exact(Lidar::half_circle(181).expect("two beams or more"))
+    exact(&Lidar::half_circle(181).expect("two beams or more"))
 }
 
 #[test]

@@ -11,17 +11,17 @@ use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 
 /// Nanoseconds between two scans of a drive.
-pub const SCAN_PERIOD_NS: i64 = 500_000_000;
+pub(crate) const SCAN_PERIOD_NS: i64 = 500_000_000;
 
 /// A scan with the odometry it was taken at.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Shot {
-    pub scan: Scan,
-    pub odom_from_base: Pose2,
+pub(crate) struct Shot {
+    pub(crate) scan: Scan,
+    pub(crate) odom_from_base: Pose2,
 }
 
 /// A room of 9 m by 7 m with a niche, two boxes and a pillar; its lower-left corner is `corner`.
-pub fn room(corner: Point2) -> World {
+pub(crate) fn room(corner: Point2) -> World {
     let outline = [
         (0.0, 0.0),
         (9.03, 0.0),
@@ -46,7 +46,7 @@ pub fn room(corner: Point2) -> World {
 }
 
 /// Where a robot is that drives an S through the room with this lower-left corner.
-pub fn route(corner: Point2) -> Vec<Pose2> {
+pub(crate) fn route(corner: Point2) -> Vec<Pose2> {
     (0..24)
         .map(|i| {
             let along = f64::from(i) * 0.25;
@@ -57,17 +57,17 @@ pub fn route(corner: Point2) -> Vec<Pose2> {
 }
 
 /// A laser without errors.
-pub fn exact(lidar: Lidar) -> Lidar {
-    Lidar { range_noise_std: 0.0, outlier_rate: 0.0, ..lidar }
+pub(crate) fn exact(lidar: &Lidar) -> Lidar {
+    Lidar { range_noise_std: 0.0, outlier_rate: 0.0, ..lidar.clone() }
 }
 
 /// An exact laser that sees all around.
-pub fn full_circle(beams: usize) -> Lidar {
-    exact(Lidar::full_circle(beams).expect("two beams or more"))
+pub(crate) fn full_circle(beams: usize) -> Lidar {
+    exact(&Lidar::full_circle(beams).expect("two beams or more"))
 }
 
 /// What `lidar` sees from each pose; odometry is the truth.
-pub fn shots(world: &World, lidar: &Lidar, poses: &[Pose2]) -> Vec<Shot> {
+pub(crate) fn shots(world: &World, lidar: &Lidar, poses: &[Pose2]) -> Vec<Shot> {
     let shot = |(index, pose): (usize, &Pose2)| {
         let mut rng = ChaCha8Rng::seed_from_u64(index as u64);
         let stamp = Stamp(1_000_000_000 + index as i64 * SCAN_PERIOD_NS);
@@ -79,18 +79,18 @@ pub fn shots(world: &World, lidar: &Lidar, poses: &[Pose2]) -> Vec<Shot> {
 }
 
 /// Few particles, and every scan of a drive through the room processed.
-pub fn parameters() -> Parameters {
+pub(crate) fn parameters() -> Parameters {
     let gate = MotionGate { linear_update: 0.1, ..MotionGate::default() };
     Parameters { particles: 8, gate, ..Parameters::default() }
 }
 
 /// A filter on the caller's thread.
-pub fn filter(parameters: &Parameters) -> GMapping {
+pub(crate) fn filter(parameters: &Parameters) -> GMapping {
     GMapping::new(parameters.clone(), 1, 1).expect("it needs no thread")
 }
 
 /// Gives a filter a scan.
-pub fn add(filter: &mut GMapping, lidar: &Lidar, shot: &Shot) -> ScanUpdate {
+pub(crate) fn add(filter: &mut GMapping, lidar: &Lidar, shot: &Shot) -> ScanUpdate {
     let reading =
         ScanReading { scan: &shot.scan, mount: &lidar.mount, odom_from_base: shot.odom_from_base };
     filter.add_scan(&reading, &mut |_| ())
