@@ -1,17 +1,20 @@
 //! How far a trajectory is from the truth.
 //!
-//! Two measures: the relation metric of Kümmerle et al. ("On measuring the accuracy of SLAM
+//! Three measures: the relation metric of Kümmerle et al. ("On measuring the accuracy of SLAM
 //! algorithms", Autonomous Robots 27, 2009) for recorded logs, whose truth is known only between
-//! pairs of poses, and the absolute trajectory error for simulations.
+//! pairs of poses, the absolute trajectory error for simulations, and the agreement of scans with
+//! those of earlier visits where no truth is known at all.
 
 mod absolute;
 mod relations;
+mod revisit;
 mod text;
 
 use thiserror::Error;
 
 pub use absolute::{Alignment, absolute_errors};
 pub use relations::{ErrorStatistics, Relation, RelationReport, Skipped, relation_errors};
+pub use revisit::{RevisitAgreement, revisit_agreement};
 pub use text::{
     TextError, parse_relations, parse_trajectory, read_relations, read_trajectory, tum,
 };
