@@ -56,14 +56,10 @@ pub(crate) fn route(corner: Point2) -> Vec<Pose2> {
         .collect()
 }
 
-/// A laser without errors.
-pub(crate) fn exact(lidar: &Lidar) -> Lidar {
-    Lidar { range_noise_std: 0.0, outlier_rate: 0.0, ..lidar.clone() }
-}
-
-/// An exact laser that sees all around.
+/// A laser without errors that sees all around.
 pub(crate) fn full_circle(beams: usize) -> Lidar {
-    exact(&Lidar::full_circle(beams).expect("two beams or more"))
+    let lidar = Lidar::full_circle(beams).expect("two beams or more");
+    Lidar { range_noise_std: 0.0, outlier_rate: 0.0, ..lidar }
 }
 
 /// What `lidar` sees from each pose; odometry is the truth.
