@@ -20,7 +20,7 @@ use gmapd::slam::grid::occupancy::OccupancyGrid;
 use gmapd::slam::motion_gate::MotionGate;
 use gmapd::slam::odometry::MotionNoise;
 use gmapd::slam::pose::{Point2, Pose2, Stamp};
-use gmapd::slam::scan::{LaserMount, MountOrientation, ScanGeometry};
+use gmapd::slam::scan::{Beam, LaserMount, MountOrientation, ScanGeometry};
 
 mod support;
 
@@ -199,6 +199,20 @@ fn zero_nan_infinite_negative_and_too_short_ranges_say_nothing() {
         let other = drive_with_every_fifth(reading, &parameters());
         assert_eq!(other.path(), nan.path(), "{reading}");
         assert_eq!(grid(&other), grid(&nan), "{reading}");
+    }
+}
+
+#[test]
+fn each_range_is_a_hit_a_no_return_or_invalid() {
+    let geometry = full_circle(4).geometry;
+    for range in [f32::NAN, f32::NEG_INFINITY, -1.0, -0.0, 0.0, 0.099] {
+        assert_eq!(geometry.classify(range), Beam::Invalid, "{range}");
+    }
+    for range in [20.0, 20.1, f32::MAX, f32::INFINITY] {
+        assert_eq!(geometry.classify(range), Beam::NoReturn, "{range}");
+    }
+    for range in [0.101, 1.0, 19.999] {
+        assert_eq!(geometry.classify(range), Beam::Hit(f64::from(range)), "{range}");
     }
 }
 
