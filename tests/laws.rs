@@ -49,7 +49,8 @@ fn cells() -> impl Strategy<Value = Cell> {
 /// A field with these hits around `centre`, of a width of some cells so that it is smooth.
 fn field(centre: Cell, hits: &[(f64, f64)]) -> TileMap<u8> {
     let mut field = TileMap::new();
-    Kernel::new(2.5).insert(&mut field, centre, hits.iter().map(|(x, y)| [*x, *y]));
+    let hits: Points = hits.iter().map(|(x, y)| (*x as f32, *y as f32)).collect();
+    Kernel::new(2.5).insert(&mut field, centre, &hits, WindowPose::new(0.0, 0.0, 0.0));
     field
 }
 
