@@ -216,7 +216,7 @@ impl GMapping {
         self.register(&scan);
         on_phase(Phase::Register);
         self.update_output(scan);
-        if report.resampled {
+        if report.resampled || self.particles.len() == 1 {
             self.output.forget_agreed(&self.tree, self.particles.iter().map(|p| p.node));
         }
         on_phase(Phase::Map);
