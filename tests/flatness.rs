@@ -21,8 +21,9 @@ const BYTES_A_POSE: usize = 2 * (48 + 8);
 /// How big a filter is.
 #[derive(Debug, Clone, Copy)]
 struct Size {
+    /// Tiles of each particle's map, summed up: how many of them are shared depends on how long
+    /// ago particles were drawn anew.
     tiles: usize,
-    tile_bytes: usize,
     output_tiles: usize,
     /// Nodes of the trajectory tree beside those of the best particle's path.
     branches: usize,
@@ -34,11 +35,9 @@ struct Size {
 impl Size {
     fn of(filter: &GMapping, region: &Region<'_, System>) -> Self {
         let memory = region.change();
-        let tiles = filter.particle_tiles();
         let poses = filter.path().len();
         Self {
-            tiles: tiles.distinct,
-            tile_bytes: tiles.bytes,
+            tiles: filter.particle_tiles().referenced,
             output_tiles: TileCounts::of(std::iter::once(filter.occupancy().counts())).distinct,
             branches: filter.trajectory_nodes() - poses,
             poses,
@@ -92,7 +91,6 @@ fn ten_laps_take_no_more_tiles_than_two() {
         let sizes = laps(particles);
         let ends = [sizes[1], sizes[9]];
         assert_flat("tiles of the particles", ends.map(|size| size.tiles));
-        assert_flat("bytes of these tiles", ends.map(|size| size.tile_bytes));
         assert_flat("tiles of the output map", ends.map(|size| size.output_tiles));
     }
 }
