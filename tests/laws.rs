@@ -375,7 +375,7 @@ fn the_incremental_map_equals_the_map_rebuilt_from_the_trajectory() {
         }
         before = path;
     }
-    assert!(outlines.len() > 100 && resampled > 2 && rewritten >= 2, "{resampled} {rewritten}");
+    assert!(outlines.len() > 100 && resampled > 1 && rewritten > 1, "{resampled} {rewritten}");
 }
 
 #[test]
