@@ -18,7 +18,7 @@ use super::trajectory::NodeId;
 /// The matcher draws all particles to nearly the same pose, so that none is right when a loop
 /// closes. Headings matter most there: an error of one degree is one metre after sixty. Sampling
 /// all three dimensions (the paper's proposal, which the original never had) costs three times the
-/// accuracy from step to step for the same spread at the end of a loop; see `benches/runs`.
+/// accuracy from step to step for the same spread at the end of a loop; see `docs/tuning.md`.
 const HEADING_SPREAD: f64 = 2.0;
 
 /// One hypothesis.
