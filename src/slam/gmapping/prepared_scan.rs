@@ -58,17 +58,21 @@ impl PreparedScan {
 /// Where the beams end in the base frame.
 ///
 /// As in slam_gmapping, readings above `maxRange` say nothing, and readings between `maxUrange`
-/// and `maxRange` make free space up to `maxUrange`.
+/// and `maxRange` make free space up to `maxUrange`. Beams without return make none where neither
+/// the parameters nor the sensor say how far it sees.
 fn outline(reading: &ScanReading<'_>, parameters: &Parameters) -> ScanOutline {
     let geometry = &reading.scan.geometry;
     let max_range = parameters.max_range.unwrap_or(f64::INFINITY);
     let usable = parameters.max_usable_range.unwrap_or(geometry.range_max());
     let usable = usable.min(max_range).min(MAX_RADIUS * parameters.resolution);
+    let limit = parameters.max_usable_range.or(parameters.max_range);
+    let reach_known = limit.is_some() || geometry.range_max().is_finite();
+    let free_on_no_return = parameters.map.free_on_no_return && reach_known;
     let end = |(index, range): (usize, &f32)| {
         let (range, kind) = match geometry.classify(*range) {
             Beam::Hit(range) if range <= usable => (range, BeamEndKind::Hit),
             Beam::Hit(range) if range <= max_range => (usable, BeamEndKind::Free),
-            Beam::NoReturn if parameters.map.free_on_no_return => (usable, BeamEndKind::Free),
+            Beam::NoReturn if free_on_no_return => (usable, BeamEndKind::Free),
             Beam::Hit(_) | Beam::NoReturn | Beam::Invalid => (0.0, BeamEndKind::Nothing),
         };
         let Point2 { x, y } = reading.mount.point_in_base(geometry.angle(index), range);

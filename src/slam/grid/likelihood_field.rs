@@ -96,7 +96,7 @@ impl WindowPose {
 
 /// A part of a field made ready for many look-ups.
 ///
-/// Points outside it read as unknown; they cannot reach memory outside it.
+/// It must be wide enough for the points: one outside reads some cell of the window, or unknown.
 #[derive(Debug)]
 pub struct Window<'a> {
     first_cell: Cell,
