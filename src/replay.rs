@@ -19,6 +19,7 @@ use crate::slam::gmapping::{
     GMapping, OdometryUpdate, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason, ThreadsError,
 };
 use crate::slam::grid::occupancy::OccupancyGrid;
+use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
 
@@ -242,9 +243,9 @@ impl Track {
 
     /// At every reading the corrected pose of the last processed scan with the odometry since;
     /// before the first processed scan, odometry traced back from it.
-    fn corrected(self, path: &[(Stamp, Pose2)]) -> Vec<StampedPose> {
-        let mut anchors = self.processed.iter().zip(path).peekable();
-        let correction = |(&index, &(_, pose_in_map)): (&usize, &(Stamp, Pose2))| {
+    fn corrected(self, path: &Path) -> Vec<StampedPose> {
+        let mut anchors = self.processed.iter().zip(path.iter()).peekable();
+        let correction = |(&index, (_, pose_in_map)): (&usize, (Stamp, Pose2))| {
             pose_in_map * self.readings[index].pose.inverse()
         };
         let mut map_from_odom =
@@ -290,7 +291,8 @@ mod tests {
         let track =
             track(&[0.0, 1.0, 2.0, 3.0, 3.5].map(|x| (at(x), OdometryUpdate::Accepted)), &[1, 3]);
         let path = [(Stamp(0), turned), (Stamp(0), at(10.0))];
-        let poses: Vec<Pose2> = track.corrected(&path).into_iter().map(|p| p.pose).collect();
+        let poses: Vec<Pose2> =
+            track.corrected(&path.into_iter().collect()).into_iter().map(|p| p.pose).collect();
         let expected = [
             Pose2::new(5.0, 4.0, turned.theta),
             turned,
@@ -311,15 +313,15 @@ mod tests {
             (at(102.0), OdometryUpdate::Accepted),
         ];
         let track = track(&readings, &[0]);
-        let poses = track.corrected(&[(Stamp(0), at(0.0))]);
+        let poses = track.corrected(&std::iter::once((Stamp(0), at(0.0))).collect());
         let x: Vec<f64> = poses.iter().map(|p| p.pose.x).collect();
         assert_eq!(x, [0.0, 0.0, 1.0, 1.0, 2.0]);
     }
 
     #[test]
     fn without_a_processed_scan_the_trajectory_is_odometry() {
-        let poses =
-            track(&[1.0, 2.0].map(|x| (at(x), OdometryUpdate::Accepted)), &[]).corrected(&[]);
+        let poses = track(&[1.0, 2.0].map(|x| (at(x), OdometryUpdate::Accepted)), &[])
+            .corrected(&Path::default());
         assert_eq!(poses.iter().map(|p| p.pose.x).collect::<Vec<_>>(), [1.0, 2.0]);
     }
 }

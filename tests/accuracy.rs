@@ -37,8 +37,11 @@ fn drive(simulation: &Simulation, particles: usize, seed: u64) -> Drive {
             truth.push(StampedPose { stamp: reading.stamp, pose: reading.world_from_base });
         }
     }
-    let path = filter.path().into_iter();
-    Drive { truth, estimate: path.map(|(stamp, pose)| StampedPose { stamp, pose }).collect() }
+    let path = filter.path();
+    Drive {
+        truth,
+        estimate: path.iter().map(|(stamp, pose)| StampedPose { stamp, pose }).collect(),
+    }
 }
 
 impl Drive {
@@ -157,7 +160,7 @@ fn scans_along_path(log: &CarmenLog, config: &Config) -> (Vec<Pose2>, Vec<Vec<Po
             hits.push(ends.map(|end| point(end.point)).collect());
         }
     }
-    (filter.path().into_iter().map(|(_, pose)| pose).collect(), hits)
+    (filter.path().iter().map(|(_, pose)| pose).collect(), hits)
 }
 
 #[test]

@@ -7,5 +7,6 @@ pub mod gmapping;
 pub mod grid;
 pub mod motion_gate;
 pub mod odometry;
+pub mod path;
 pub mod pose;
 pub mod scan;

@@ -32,6 +32,7 @@ use self::trajectory::TrajectoryTree;
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
 use super::odometry::Motion;
+use super::path::Path;
 use super::pose::{Pose2, Stamp, wrap_angle};
 use super::scan::{LaserMount, Scan};
 
@@ -381,8 +382,8 @@ impl GMapping {
 
     /// The pose of each processed scan as the best particle sees it now, oldest first.
     #[must_use]
-    pub fn path(&self) -> Vec<(Stamp, Pose2)> {
-        let Some(best) = self.best() else { return Vec::new() };
+    pub fn path(&self) -> Path {
+        let Some(best) = self.best() else { return Path::default() };
         let poses: Vec<Pose2> =
             self.tree.ancestry(best.node).map(|node| self.tree.pose(node)).collect();
         self.stamps.iter().copied().zip(poses.into_iter().rev()).collect()

@@ -1,0 +1,80 @@
+//! The keys of one robot.
+
+use thiserror::Error;
+use zenoh::key_expr::{KeyExpr, OwnedKeyExpr};
+
+/// What every key of a robot begins with.
+///
+/// May be empty: then the robot's keys are `scan`, `map` and so on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Prefix(Option<OwnedKeyExpr>);
+
+/// Why a key cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum KeyError {
+    /// Zenoh does not take it.
+    #[error("{key:?} is no key: {reason}")]
+    Invalid {
+        /// What was given.
+        key: String,
+        /// What Zenoh says.
+        reason: String,
+    },
+    /// It stands for many keys.
+    #[error("{0:?} has a wildcard; the keys of one robot are needed, as in robot01")]
+    Wildcard(String),
+}
+
+impl Prefix {
+    /// Parses what the user gave; slashes at either end do not matter.
+    ///
+    /// # Errors
+    /// When it is not part of a key or has wildcards.
+    pub fn parse(text: &str) -> Result<Self, KeyError> {
+        let text = text.trim_matches('/');
+        if text.is_empty() { Ok(Self(None)) } else { Ok(Self(Some(literal_key(text)?))) }
+    }
+
+    /// A key of the robot: `name` under the prefix, such as `map` or `slam/status`.
+    ///
+    /// # Errors
+    /// When `name` is not part of a key or has wildcards.
+    pub fn key(&self, name: &str) -> Result<OwnedKeyExpr, KeyError> {
+        match &self.0 {
+            Some(prefix) => literal_key(&format!("{prefix}/{name}")),
+            None => literal_key(name),
+        }
+    }
+}
+
+impl std::fmt::Display for Prefix {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.as_ref().map_or(Ok(()), |prefix| prefix.fmt(formatter))
+    }
+}
+
+fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
+    let key = KeyExpr::autocanonize(text.to_owned())
+        .map_err(|error| KeyError::Invalid { key: text.to_owned(), reason: error.to_string() })?;
+    if key.is_wild() {
+        return Err(KeyError::Wildcard(text.to_owned()));
+    }
+    Ok(key.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_under_the_prefix() {
+        let key = |prefix: &str, name: &str| {
+            Prefix::parse(prefix).and_then(|prefix| prefix.key(name)).map(|key| key.to_string())
+        };
+        assert_eq!(key("robot01", "map").unwrap(), "robot01/map");
+        assert_eq!(key("/site/robot01/", "slam/status").unwrap(), "site/robot01/slam/status");
+        assert_eq!(key("", "scan").unwrap(), "scan");
+        assert_eq!(key("robot*", "map"), Err(KeyError::Wildcard("robot*".to_owned())));
+        assert!(matches!(key("robot01", "a//b"), Err(KeyError::Invalid { .. })));
+    }
+}

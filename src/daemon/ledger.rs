@@ -1,0 +1,140 @@
+//! What became of every scan: a verdict each, counted.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use crate::slam::gmapping::SkipReason;
+use crate::slam::pose::Stamp;
+
+/// What became of a scan.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// It is in the map.
+    Processed,
+    /// The robot had not moved enough since the last processed scan.
+    NotMovedEnough,
+    /// Not the n-th scan that `throttle_scans` asks for.
+    Throttled,
+    /// No beam is a hit within `maxUrange`.
+    NoUsableBeams,
+    /// Its odometry is not finite, or further away than a robot gets.
+    BadOdometry,
+    /// Odometry for its stamp did not come in time.
+    NoOdometry,
+    /// Where the laser sits on the robot is not known.
+    NoMount,
+    /// The laser does not scan parallel to the floor.
+    TiltedMount,
+    /// Its stamp or its angles and ranges make no sense.
+    BadGeometry,
+    /// Its bytes are no laser scan.
+    NotDecodable,
+    /// There was one with the same stamp.
+    Duplicate,
+    /// A newer one was taken before it came.
+    Late,
+    /// It waited while too many newer ones came.
+    Overload,
+    /// Mapping is paused.
+    Paused,
+}
+
+impl Verdict {
+    /// All verdicts, so that a count of zero is told too.
+    pub const ALL: [Self; 14] = [
+        Self::Processed,
+        Self::NotMovedEnough,
+        Self::Throttled,
+        Self::NoUsableBeams,
+        Self::BadOdometry,
+        Self::NoOdometry,
+        Self::NoMount,
+        Self::TiltedMount,
+        Self::BadGeometry,
+        Self::NotDecodable,
+        Self::Duplicate,
+        Self::Late,
+        Self::Overload,
+        Self::Paused,
+    ];
+}
+
+impl From<SkipReason> for Verdict {
+    fn from(reason: SkipReason) -> Self {
+        match reason {
+            SkipReason::Throttled => Self::Throttled,
+            SkipReason::NotMovedEnough => Self::NotMovedEnough,
+            SkipReason::NoUsableBeams => Self::NoUsableBeams,
+            SkipReason::BadOdometry => Self::BadOdometry,
+        }
+    }
+}
+
+/// A scan's verdict with what there is to say about it: one sample on `slam/verdict`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Entry {
+    /// How many scans have had their verdict, this one included.
+    pub number: u64,
+    /// The scan's; `None` if its bytes could not be read.
+    pub stamp: Option<Stamp>,
+    /// What became of it.
+    pub verdict: Verdict,
+    /// What is wrong and what to do, in a sentence; empty where nothing is.
+    pub detail: String,
+}
+
+/// The verdicts so far.
+#[derive(Debug, Clone, Default)]
+pub struct Ledger {
+    counts: BTreeMap<Verdict, u64>,
+    total: u64,
+    last: BTreeMap<Verdict, Entry>,
+}
+
+impl Ledger {
+    /// Enters a verdict and returns its entry.
+    pub fn enter(&mut self, stamp: Option<Stamp>, verdict: Verdict, detail: String) -> &Entry {
+        *self.counts.entry(verdict).or_default() += 1;
+        self.total += 1;
+        let entry = Entry { number: self.total, stamp, verdict, detail };
+        self.last.insert(verdict, entry);
+        &self.last[&verdict]
+    }
+
+    /// How many scans had this verdict.
+    #[must_use]
+    pub fn count(&self, verdict: Verdict) -> u64 {
+        self.counts.get(&verdict).copied().unwrap_or(0)
+    }
+
+    /// How many scans had a verdict.
+    #[must_use]
+    pub const fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// The last entry of each verdict that occurred.
+    #[must_use]
+    pub const fn last(&self) -> &BTreeMap<Verdict, Entry> {
+        &self.last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_verdict_is_counted_and_its_last_entry_kept() {
+        let mut ledger = Ledger::default();
+        ledger.enter(Some(Stamp(1)), Verdict::Late, "first".to_owned());
+        ledger.enter(None, Verdict::NotDecodable, String::new());
+        let entry = ledger.enter(Some(Stamp(2)), Verdict::Late, "second".to_owned()).clone();
+        assert_eq!(entry.number, 3);
+        assert_eq!((ledger.total(), ledger.count(Verdict::Late)), (3, 2));
+        assert_eq!(ledger.count(Verdict::Processed), 0);
+        assert_eq!(ledger.last()[&Verdict::Late], entry);
+    }
+}

@@ -1,0 +1,78 @@
+//! What the filter knows, for all who ask: immutable, shared, and replaced as a whole.
+
+use std::sync::Arc;
+
+use nalgebra::Matrix3;
+use serde::Serialize;
+
+use super::ledger::Ledger;
+use crate::slam::gmapping::ScanReport;
+use crate::slam::grid::occupancy::OccupancyMap;
+use crate::slam::path::Path;
+use crate::slam::pose::{Pose2, Stamp};
+use crate::statistics::Spread;
+
+/// What the filter knew at one moment.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    /// Where the robot is.
+    pub estimate: Estimate,
+    /// What became of the scans.
+    pub ledger: Ledger,
+    /// Milliseconds that the last processed scans took; `None` before the first.
+    pub milliseconds_per_scan: Option<Spread>,
+    /// How many times particles were drawn anew.
+    pub resamples: u64,
+    /// Whether scans are taken.
+    pub paused: bool,
+    /// The map, `None` before the first scan and after a reset; often older than the estimate.
+    pub map: Option<Arc<MapVersion>>,
+}
+
+/// Where the robot is, and how sure that is.
+#[derive(Debug, Clone)]
+pub struct Estimate {
+    /// Of the last scan or odometry that moved the pose; `None` before the first.
+    pub stamp: Option<Stamp>,
+    /// The base in `map`.
+    pub pose_in_map: Pose2,
+    /// Of the cloud of particles: m², m rad, rad².
+    pub covariance: Matrix3<f64>,
+    /// What takes odometry to the map.
+    pub map_from_odom: Pose2,
+    /// The base in `map`, one pose a particle, at the last processed scan.
+    pub particles: Arc<[Pose2]>,
+    /// About the last processed scan; `None` before the first.
+    pub report: Option<ScanReport>,
+}
+
+/// One version of the map. A copy costs little: tiles and poses are shared.
+#[derive(Debug)]
+pub struct MapVersion {
+    /// From 1; grows with every change, over resets too.
+    pub version: u64,
+    /// Of the last scan in it.
+    pub stamp: Stamp,
+    /// Hits and visits of each cell.
+    pub occupancy: OccupancyMap,
+    /// A cell is occupied when its hits / visits is above this.
+    pub occupied_threshold: f64,
+    /// The pose of the base at each processed scan.
+    pub path: Path,
+}
+
+/// What the daemon is doing, in one word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// No scan has come, or none for a while.
+    WaitingForScans,
+    /// Scans come, and no odometry for them.
+    WaitingForOdometry,
+    /// Scans enter the map.
+    Mapping,
+    /// Scans come, and many of them are lost or do not match.
+    Degraded,
+    /// By command.
+    Paused,
+}
