@@ -12,11 +12,13 @@
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
+//! - [`daemon`]: live mapping on a Zenoh mesh;
 //! - [`files`], [`clock`], [`statistics`]: whole files, clocks, percentiles.
 
 pub mod clock;
 pub mod config;
 pub mod convert;
+pub mod daemon;
 pub mod evaluation;
 pub mod files;
 pub mod logs;

@@ -66,7 +66,7 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 14] = [
+const MAY_USE: [(&str, &[&str]); 15] = [
     ("slam", &[]),
     ("sim", &["slam"]),
     ("logs", &["slam"]),
@@ -78,6 +78,25 @@ const MAY_USE: [(&str, &[&str]); 14] = [
     ("replay", &["clock", "config", "evaluation", "logs", "slam", "statistics"]),
     ("map", &["slam", "statistics"]),
     ("evaluation", &["slam", "statistics"]),
+    (
+        "daemon",
+        &[
+            "clock",
+            "config",
+            "convert",
+            "evaluation",
+            "files",
+            "logs",
+            "map",
+            "replay",
+            "ros",
+            "sim",
+            "slam",
+            "statistics",
+            "tf",
+            "timeline",
+        ],
+    ),
     ("files", &[]),
     ("clock", &[]),
     ("statistics", &[]),
