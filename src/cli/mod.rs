@@ -3,6 +3,8 @@
 mod evaluate;
 mod progress;
 mod replay;
+#[allow(dead_code, reason = "the subcommands that use it follow")]
+mod session;
 mod simulate;
 
 use clap::{Parser, Subcommand};
