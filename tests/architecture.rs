@@ -75,7 +75,7 @@ const MAY_USE: [(&str, &[&str]); 15] = [
     ("convert", &["ros", "slam", "tf"]),
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
-    ("replay", &["clock", "config", "evaluation", "logs", "slam", "statistics"]),
+    ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
     ("map", &["slam", "statistics"]),
     ("evaluation", &["slam", "statistics"]),
     (
