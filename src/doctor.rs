@@ -14,4 +14,4 @@ mod watch;
 pub use finding::Finding;
 pub use report::Report;
 pub use turn::laser_turn;
-pub use watch::{FrameNames, Input, Watch};
+pub use watch::{FrameNames, Input, Keys, Watch};

@@ -5,7 +5,7 @@
 mod backlog;
 mod stamps;
 
-pub use backlog::{Backlog, Room};
+pub use backlog::{Backlog, Room, VerdictMessage};
 pub use stamps::{LogFault, Restamper, Survey};
 
 use crate::convert::{self, OdometrySample};

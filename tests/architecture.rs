@@ -76,7 +76,8 @@ const MAY_USE: [(&str, &[&str]); 17] = [
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
     ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
-    ("playback", &["convert", "logs", "ros", "slam"]),
+    // Its tests read what the daemon writes.
+    ("playback", &["convert", "daemon", "logs", "ros", "slam"]),
     (
         "doctor",
         // Its tests watch simulated robots.

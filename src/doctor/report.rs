@@ -66,11 +66,11 @@ impl Report {
     fn arrivals(&mut self, watch: &Watch) {
         let received = |input: Input| watch.inputs[input as usize].received;
         if received(Input::Scan) == 0 {
-            self.findings.push(Finding::NothingArrives { key: watch.key(Input::Scan.key()) });
+            self.findings.push(Finding::NothingArrives { key: watch.key(Input::Scan) });
         }
         if received(Input::Odom) == 0 && watch.tf_odometry.is_empty() {
             self.findings.push(Finding::NoOdometry {
-                key: watch.key(Input::Odom.key()),
+                key: watch.key(Input::Odom),
                 odom: watch.names.odom.clone(),
                 base: watch.names.base.clone(),
             });
@@ -79,7 +79,7 @@ impl Report {
             let Counts { received, rejected, reason } = &watch.inputs[input as usize];
             if *rejected > 0 {
                 self.findings.push(Finding::Unusable {
-                    key: watch.key(input.key()),
+                    key: watch.key(input),
                     rejected: *rejected,
                     received: *received,
                     reason: reason.clone(),
@@ -241,7 +241,7 @@ impl Report {
 
     fn daemon(&mut self, watch: &Watch) {
         match &watch.status {
-            None => self.findings.push(Finding::NoDaemon { key: watch.key("slam/status") }),
+            None => self.findings.push(Finding::NoDaemon { key: watch.keys.status.clone() }),
             Some(status) if status.state == "mapping" => {
                 self.facts.push(format!("daemon: mapping. {}", status.detail));
             }

@@ -19,6 +19,11 @@ fn drive(orientation: MountOrientation) -> Vec<Reading> {
     simulation.readings().take(400).collect()
 }
 
+fn keys() -> Keys {
+    let key = |name: &str| format!("robot01/{name}");
+    Keys { inputs: Input::ALL.map(|input| key(input.name())), status: key("slam/status") }
+}
+
 /// What a test changes about the messages of a healthy robot.
 struct Robot {
     mount: Option<LaserMount>,
@@ -35,7 +40,7 @@ fn healthy(orientation: MountOrientation) -> Robot {
 impl Robot {
     fn watched(&self, readings: &[Reading]) -> Report {
         let names = FrameNames { odom: "odom".to_owned(), base: "base_link".to_owned() };
-        let mut watch = Watch::new("robot01", names);
+        let mut watch = Watch::new(keys(), names);
         if let Some(mount) = &self.mount {
             let message = ros::cdr(&Frames::default().mount(Stamp(0), mount));
             watch.add(Input::TfStatic, Stamp(0), (&message, ""));
@@ -194,7 +199,7 @@ fn silence_is_three_findings() {
 #[test]
 fn odometry_from_transforms_is_odometry() {
     let names = FrameNames { odom: "odom".to_owned(), base: "base_link".to_owned() };
-    let mut watch = Watch::new("", names);
+    let mut watch = Watch::new(keys(), names);
     for reading in drive(MountOrientation::Upright) {
         let header = convert::header(reading.stamp, "odom");
         let transform = convert::transform_stamped(header, "base_link", reading.odom_from_base);
@@ -215,7 +220,7 @@ fn odometry_from_transforms_is_odometry() {
 #[test]
 fn a_tilted_laser_is_found() {
     let names = FrameNames { odom: "odom".to_owned(), base: "base_link".to_owned() };
-    let mut watch = Watch::new("robot01", names);
+    let mut watch = Watch::new(keys(), names);
     let tilt = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2);
     let mut message = Frames::default().mount(Stamp(0), &LaserMount::default());
     message.transforms[0].transform.rotation =

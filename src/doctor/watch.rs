@@ -36,9 +36,9 @@ impl Input {
     /// All of them.
     pub const ALL: [Self; 4] = [Self::Scan, Self::Odom, Self::Tf, Self::TfStatic];
 
-    /// Its key under a robot's prefix.
+    /// Its key under a robot's prefix, unless the daemon is configured otherwise.
     #[must_use]
-    pub const fn key(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Self::Scan => "scan",
             Self::Odom => "odom",
@@ -46,6 +46,15 @@ impl Input {
             Self::TfStatic => "tf_static",
         }
     }
+}
+
+/// The keys that are watched, in full.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Keys {
+    /// In the order of [`Input::ALL`].
+    pub inputs: [String; Input::ALL.len()],
+    /// Where the daemon is asked how it is.
+    pub status: String,
 }
 
 /// What the frames are called.
@@ -60,8 +69,7 @@ pub struct FrameNames {
 /// What was seen of a robot.
 #[derive(Debug)]
 pub struct Watch {
-    /// What the keys begin with, with a slash at its end where there is one.
-    pub(super) prefix: String,
+    pub(super) keys: Keys,
     pub(super) names: FrameNames,
     pub(super) inputs: [Counts; Input::ALL.len()],
     pub(super) scans: Vec<SeenScan>,
@@ -109,11 +117,11 @@ pub(super) struct DaemonStatus {
 }
 
 impl Watch {
-    /// Begins to watch the robot whose keys begin with `prefix`; `names` are the daemon's.
+    /// Begins to watch a robot.
     #[must_use]
-    pub fn new(prefix: &str, names: FrameNames) -> Self {
+    pub fn new(keys: Keys, names: FrameNames) -> Self {
         Self {
-            prefix: if prefix.is_empty() { String::new() } else { format!("{prefix}/") },
+            keys,
             names,
             inputs: Default::default(),
             scans: Vec::new(),
@@ -200,8 +208,8 @@ impl Watch {
         if self.odometry.is_empty() { &self.tf_odometry } else { &self.odometry }
     }
 
-    pub(super) fn key(&self, name: &str) -> String {
-        format!("{}{name}", self.prefix)
+    pub(super) fn key(&self, input: Input) -> String {
+        self.keys.inputs[input as usize].clone()
     }
 }
 

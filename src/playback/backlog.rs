@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use serde::Deserialize;
+
 use crate::slam::pose::Stamp;
 
 /// Scans without a verdict; the daemon's own queue takes twice as many by default.
@@ -13,6 +15,15 @@ const MOST_AHEAD_S: f64 = 3.0;
 
 /// Odometry that nobody has acknowledged; the daemon's own queue takes four times as many.
 const MOST_ODOMETRY: u64 = 1000;
+
+/// What the daemon tells of a scan on `slam/verdict`.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct VerdictMessage {
+    /// The scan's; `None` if its bytes could not be read.
+    pub stamp: Option<Stamp>,
+    /// What became of it, such as `processed`.
+    pub verdict: String,
+}
 
 /// What was sent, and what of it is known to have arrived.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -113,6 +124,17 @@ mod tests {
             backlog.scan_sent(seconds(index as f64 / 10.0));
         }
         backlog
+    }
+
+    #[test]
+    fn verdicts_are_read_as_the_ledger_tells_them() {
+        let mut ledger = crate::daemon::ledger::Ledger::default();
+        let verdict = crate::daemon::ledger::Verdict::NotMovedEnough;
+        let entry = ledger.enter(Some(Stamp(7)), verdict, String::new());
+        let told = serde_json::to_vec(entry).unwrap();
+        let read: VerdictMessage = serde_json::from_slice(&told).unwrap();
+        let verdict = "not_moved_enough".to_owned();
+        assert_eq!(read, VerdictMessage { stamp: Some(Stamp(7)), verdict });
     }
 
     #[test]
