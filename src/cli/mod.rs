@@ -1,9 +1,17 @@
 //! The subcommands: one file each.
 
+mod doctor;
 mod evaluate;
+mod feed;
+mod get;
+mod list;
+mod mesh;
+mod play;
 mod progress;
+mod readable;
 mod replay;
-#[allow(dead_code, reason = "the subcommands that use it follow")]
+mod save;
+#[allow(dead_code, reason = "the daemon uses the rest")]
 mod session;
 mod simulate;
 
@@ -14,6 +22,8 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd get robot01 map                          a robot's map, drawn\n  \
+        gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
         gmapd replay run.log --out out                 map a recorded run\n  \
         gmapd replay run.log --set particles=60        with more particles\n  \
@@ -29,6 +39,16 @@ pub(crate) struct Arguments {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
+    /// Send a recorded run onto the mesh
+    Play(play::Arguments),
+    /// Ask a robot for its map, pose, path or status
+    Get(get::Arguments),
+    /// Save a robot's map here: PGM and YAML
+    Save(save::Arguments),
+    /// List the robots that are alive
+    List(list::Arguments),
+    /// Watch a robot's input and say what is wrong
+    Doctor(doctor::Arguments),
     /// Map a recorded run
     Replay(replay::Arguments),
     /// Drive a simulated robot and record what it sees
@@ -40,6 +60,11 @@ pub(crate) enum Command {
 /// Runs a subcommand to its end.
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
+        Command::Play(arguments) => play::run(&arguments),
+        Command::Get(arguments) => get::run(&arguments),
+        Command::Save(arguments) => save::run(&arguments),
+        Command::List(arguments) => list::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),

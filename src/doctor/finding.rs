@@ -2,6 +2,12 @@
 
 use thiserror::Error;
 
+/// There are four ways to get left and right wrong.
+const UNMIRROR: &str = "if the laser hangs upside down, say so: roll of 180 degrees in its \
+     transform, or laser: {upside_down: true}; if the transform says so and it stands upright, \
+     take that out; else turn off the driver's inversion, or turn the sign of odometry's yaw \
+     (counter-clockwise is positive)";
+
 /// Something that keeps maps from being good; it tells itself in a sentence.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Finding {
@@ -198,11 +204,7 @@ impl Finding {
                  yaw, upside_down}} in the daemon's configuration"
             ),
             Self::Tilted(_) => "mount it level, or correct the transform".to_owned(),
-            Self::Mirrored { .. } => "if the laser hangs upside down, say so: roll of 180 degrees \
-                 in its transform, or laser: {upside_down: true}; if the transform says so and it \
-                 stands upright, take that out; else turn off the driver's inversion, or turn the \
-                 sign of odometry's yaw (counter-clockwise is positive)"
-                .to_owned(),
+            Self::Mirrored { .. } => UNMIRROR.to_owned(),
             Self::TurnScale { .. } => "calibrate odometry's yaw: wheel base, encoder ticks, \
                  degrees for radians; or use the IMU's"
                 .to_owned(),

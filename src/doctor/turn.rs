@@ -78,17 +78,16 @@ impl Profiles {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::pose::{Pose2, Stamp};
+    use crate::slam::pose::{Stamp, wrap_angle};
     use crate::slam::scan::ScanGeometry;
 
     /// From the middle of a room of 6 m by 4 m that has a pillar.
     fn room(heading: f64, geometry: ScanGeometry, beams: usize) -> Scan {
         let range = |index| {
-            let (sin, cos) = libm::sincos(heading + geometry.angle(index));
+            let direction = heading + geometry.angle(index);
+            let (sin, cos) = libm::sincos(direction);
             let wall = (3.0 / cos.abs()).min(2.0 / sin.abs());
-            let pillar =
-                Pose2::new(0.0, 0.0, heading + geometry.angle(index)).theta.rem_euclid(6.283);
-            if (pillar - 1.0).abs() < 0.2 { 0.8 } else { wall as f32 }
+            if wrap_angle(direction - 1.0).abs() < 0.2 { 0.8 } else { wall as f32 }
         };
         Scan { stamp: Stamp(0), geometry, ranges: (0..beams).map(range).collect() }
     }
