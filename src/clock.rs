@@ -4,6 +4,13 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
+/// The time now, to compare with other times of this process.
+#[must_use]
+#[allow(clippy::disallowed_methods, reason = "this module is where clocks are read")]
+pub fn now() -> Instant {
+    Instant::now()
+}
+
 /// Wall time and the process's CPU time, all threads together.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Elapsed {

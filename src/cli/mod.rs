@@ -3,7 +3,8 @@
 mod evaluate;
 mod progress;
 mod replay;
-#[allow(dead_code, reason = "the subcommands that use it follow")]
+mod run;
+#[allow(dead_code, reason = "open() is for subcommands that follow")]
 mod session;
 mod simulate;
 
@@ -14,6 +15,7 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
         gmapd replay run.log --out out                 map a recorded run\n  \
         gmapd replay run.log --set particles=60        with more particles\n  \
@@ -29,6 +31,8 @@ pub(crate) struct Arguments {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
+    /// Map live: scans and odometry from a Zenoh mesh, map and pose to it
+    Run(run::Arguments),
     /// Map a recorded run
     Replay(replay::Arguments),
     /// Drive a simulated robot and record what it sees
@@ -40,6 +44,7 @@ pub(crate) enum Command {
 /// Runs a subcommand to its end.
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
+        Command::Run(arguments) => run::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
