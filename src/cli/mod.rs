@@ -10,8 +10,8 @@ mod play;
 mod progress;
 mod readable;
 mod replay;
+mod run;
 mod save;
-#[allow(dead_code, reason = "the daemon uses the rest")]
 mod session;
 mod simulate;
 
@@ -22,6 +22,7 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
         gmapd get robot01 map                          a robot's map, drawn\n  \
         gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
@@ -39,6 +40,8 @@ pub(crate) struct Arguments {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
+    /// Map live: scans and odometry from a Zenoh mesh, map and pose to it
+    Run(run::Arguments),
     /// Send a recorded run onto the mesh
     Play(play::Arguments),
     /// Ask a robot for its map, pose, path or status
@@ -60,6 +63,7 @@ pub(crate) enum Command {
 /// Runs a subcommand to its end.
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
+        Command::Run(arguments) => run::run(&arguments),
         Command::Play(arguments) => play::run(&arguments),
         Command::Get(arguments) => get::run(&arguments),
         Command::Save(arguments) => save::run(&arguments),

@@ -81,11 +81,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let session = arguments.session.open().await?;
         let mut feed = Feed::open(&session, &arguments.prefix).await?;
         let watch = Stopwatch::start();
-        let interrupted = tokio::select! {
-            played = play(&mut feed, &log, survey, arguments) => played.map(|()| false),
-            signal = tokio::signal::ctrl_c() => signal.map(|()| true).context("no signals come"),
+        let how = tokio::select! {
+            played = play(&mut feed, &log, survey, arguments) => played.map(|()| "played"),
+            signal = tokio::signal::ctrl_c() => {
+                signal.map(|()| "interrupted after").context("no signals come")
+            }
         }?;
-        println!("{}", told(&feed, watch.elapsed().wall, interrupted));
+        println!("{how} {}", told(&feed, watch.elapsed().wall));
         session.close().await.ok();
         Ok(())
     })
@@ -162,11 +164,10 @@ async fn send_all(
     Ok(())
 }
 
-/// What became of the scans, in a line or two.
-fn told(feed: &Feed, wall: Duration, interrupted: bool) -> String {
+/// How many scans that were, and what became of them.
+fn told(feed: &Feed, wall: Duration) -> String {
     let (sent, tally) = feed.tally();
-    let how = if interrupted { "interrupted after" } else { "played" };
-    let mut text = format!("{how} {sent} scans in {:.1} s", wall.as_secs_f64());
+    let mut text = format!("{sent} scans in {:.1} s", wall.as_secs_f64());
     for (verdict, count) in tally {
         text += &format!(", {count} {}", verdict.replace('_', " "));
     }
