@@ -1,5 +1,6 @@
 //! The subcommands: one file each.
 
+mod demo;
 mod doctor;
 mod evaluate;
 mod feed;
@@ -22,6 +23,7 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd demo                                     a simulated robot and its map, in a minute\n  \
         gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
         gmapd get robot01 map                          a robot's map, drawn\n  \
         gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
@@ -42,6 +44,8 @@ pub(crate) struct Arguments {
 pub(crate) enum Command {
     /// Map live: scans and odometry from a Zenoh mesh, map and pose to it
     Run(run::Arguments),
+    /// See it work: a simulated robot and its map
+    Demo(demo::Arguments),
     /// Send a recorded run onto the mesh
     Play(play::Arguments),
     /// Ask a robot for its map, pose, path or status
@@ -64,6 +68,7 @@ pub(crate) enum Command {
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
         Command::Run(arguments) => run::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments),
         Command::Play(arguments) => play::run(&arguments),
         Command::Get(arguments) => get::run(&arguments),
         Command::Save(arguments) => save::run(&arguments),
