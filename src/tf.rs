@@ -255,6 +255,14 @@ impl TfBuffer {
         Ok(shared_from_target.inv_mul(&shared_from_source))
     }
 
+    /// Whether where `frame` is in its parent tells part of the way between two other frames.
+    #[must_use]
+    pub fn is_between(&self, frame: &str, target: &str, source: &str) -> bool {
+        let frame = without_slash(frame);
+        let hangs = |from| self.chain(without_slash(from)).any(|ancestor| ancestor == frame);
+        self.links.contains_key(frame) && hangs(source) != hangs(target)
+    }
+
     /// The frames that transforms have named, in the order of the alphabet.
     #[must_use]
     pub fn frames(&self) -> Vec<&str> {
@@ -497,6 +505,18 @@ mod tests {
         assert_eq!(error.to_string(), "a frame's name has 257 bytes; 1 to 256 are possible");
         hang_from("frame1", "frame2").unwrap();
         assert_eq!(buffer.counts().refused, 3);
+    }
+
+    #[test]
+    fn a_link_is_between_two_frames_or_it_is_not() {
+        let mut buffer = TfBuffer::new(Duration::from_secs(10));
+        for (parent, child) in [("odom", "foot"), ("foot", "base"), ("base", "laser")] {
+            buffer.insert(&transform(parent, child, 0, place(0.3, 0.0)), Kind::Dynamic).unwrap();
+        }
+        let between = |frame| buffer.is_between(frame, "/odom", "base");
+        assert!(between("base") && between("/foot"));
+        assert!(!between("laser") && !between("odom") && !between("nobody"));
+        assert!(buffer.is_between("laser", "laser", "foot"));
     }
 
     fn rotations() -> impl Strategy<Value = UnitQuaternion<f64>> {

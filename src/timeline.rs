@@ -169,6 +169,20 @@ impl<T: Interpolate> Timeline<T> {
         Ok(earlier.interpolate(later, fraction))
     }
 
+    /// The stamp of the first sample at or after a stamp.
+    #[must_use]
+    pub fn next(&self, stamp: Stamp) -> Option<Stamp> {
+        let position = self.samples.partition_point(|(other, _)| *other < stamp);
+        self.samples.get(position).map(|(stamp, _)| *stamp)
+    }
+
+    /// The samples after one stamp, or from the oldest on, and up to another, which is included.
+    pub fn between(&self, after: Option<Stamp>, until: Stamp) -> impl Iterator<Item = &(Stamp, T)> {
+        let from = after.map_or(0, |after| self.samples.partition_point(|(s, _)| *s <= after));
+        let to = self.samples.partition_point(|(s, _)| *s <= until);
+        self.samples.range(from..to.max(from))
+    }
+
     /// The stamp of the oldest sample.
     #[must_use]
     pub fn oldest(&self) -> Option<Stamp> {
@@ -246,6 +260,22 @@ mod tests {
         assert!((theta - PI).abs() < 1e-12, "{theta}");
         let theta = later.interpolate(&earlier, 0.25).theta;
         assert!((theta - (-PI + 0.2)).abs() < 1e-12, "{theta}");
+    }
+
+    #[test]
+    fn a_stretch_begins_after_one_stamp_and_ends_with_another() {
+        let buffer = filled(&[0, 100, 200, 300]);
+        let stretch = |after: Option<i64>, until: i64| -> Vec<f64> {
+            let samples = buffer.between(after.map(milliseconds), milliseconds(until));
+            samples.map(|(_, pose)| pose.x).collect()
+        };
+        assert_eq!(stretch(None, 100), [0.0, 100.0]);
+        assert_eq!(stretch(Some(100), 250), [200.0]);
+        assert_eq!(stretch(Some(50), 300), [100.0, 200.0, 300.0]);
+        assert_eq!(stretch(Some(300), 100), [0.0; 0]);
+        assert_eq!(buffer.next(milliseconds(100)), Some(milliseconds(100)));
+        assert_eq!(buffer.next(milliseconds(101)), Some(milliseconds(200)));
+        assert_eq!(buffer.next(milliseconds(301)), None);
     }
 
     #[test]

@@ -162,6 +162,8 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("jump_max_step_m", raw.jump_max_step_m, Positive),
         ("delta", raw.resolution, Between(0.001, 10.0)),
         ("occ_thresh", raw.occupied_threshold, Between(0.0, 1.0)),
+        ("odometry_timeout_s", raw.odometry_timeout_s, Between(0.01, 5.0)),
+        ("scan_queue", raw.scan_queue as f64, Between(1.0, 1000.0)),
     ];
     let optional = [
         ("maxRange", raw.max_range, Positive),

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-pub use raw::{Jump, Laser, Matcher, RawConfig, Smoothing};
+pub use raw::{Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, Smoothing};
 pub use source::Origin;
 
 use crate::slam::gmapping::{

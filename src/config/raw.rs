@@ -28,6 +28,20 @@ pub struct RawConfig {
     pub transform_publish_period: f64,
     /// Seconds by which `map` to `odom` is dated ahead; left out, `transform_publish_period`.
     pub tf_delay: Option<f64>,
+    /// What every key of the robot begins with, such as `robot01`; may be empty.
+    pub prefix: String,
+    /// The inputs' keys under the prefix.
+    pub keys: Keys,
+    /// Where odometry comes from.
+    pub odometry_source: OdometrySource,
+    /// Seconds that a scan waits for its odometry.
+    pub odometry_timeout_s: f64,
+    /// Scans that may wait.
+    pub scan_queue: usize,
+    /// Directory that maps are saved in.
+    pub save_directory: String,
+    /// Name under which the map is saved when the daemon ends; left out, it is not.
+    pub save_on_exit: Option<String>,
 
     /// Readings strictly above are discarded, m; left out, the sensor's own limit.
     #[serde(rename = "maxRange")]
@@ -155,6 +169,13 @@ impl Default for RawConfig {
             map_update_interval: 5.0,
             transform_publish_period: 0.05,
             tf_delay: None,
+            prefix: String::new(),
+            keys: Keys::default(),
+            odometry_source: OdometrySource::Auto,
+            odometry_timeout_s: 0.5,
+            scan_queue: 32,
+            save_directory: "maps".to_owned(),
+            save_on_exit: None,
             max_range: core.max_range,
             max_usable_range: core.max_usable_range,
             beam_skip: core.matcher.beam_skip,
@@ -209,6 +230,43 @@ pub struct Laser {
     pub yaw: f64,
     /// Whether it is mounted upside down.
     pub upside_down: bool,
+}
+
+/// The keys of the inputs, under the prefix.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Keys {
+    /// Sweeps: `sensor_msgs/LaserScan`.
+    pub scan: String,
+    /// Odometry: `nav_msgs/Odometry`.
+    pub odom: String,
+    /// Transforms that change: `tf2_msgs/TFMessage`.
+    pub tf: String,
+    /// Transforms that do not: `tf2_msgs/TFMessage`.
+    pub tf_static: String,
+}
+
+impl Default for Keys {
+    fn default() -> Self {
+        Self {
+            scan: "scan".to_owned(),
+            odom: "odom".to_owned(),
+            tf: "tf".to_owned(),
+            tf_static: "tf_static".to_owned(),
+        }
+    }
+}
+
+/// Where odometry comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OdometrySource {
+    /// Messages on `odom`, or transforms if there are none when mapping begins.
+    Auto,
+    /// Messages on `odom`.
+    Odom,
+    /// Transforms from `odom_frame` to `base_frame`.
+    Tf,
 }
 
 /// Which scan matcher runs.

@@ -3,6 +3,9 @@
 use thiserror::Error;
 use zenoh::key_expr::{KeyExpr, OwnedKeyExpr};
 
+use super::input::Input;
+use crate::config::Keys;
+
 /// What every key of a robot begins with.
 ///
 /// May be empty: then the robot's keys are `scan`, `map` and so on.
@@ -53,6 +56,44 @@ impl std::fmt::Display for Prefix {
     }
 }
 
+/// The keys that the daemon listens to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InputKeys {
+    keys: [OwnedKeyExpr; Input::ALL.len()],
+}
+
+impl InputKeys {
+    /// The configured names under the prefix.
+    ///
+    /// # Errors
+    /// When one of them is not part of a key or has wildcards.
+    pub fn new(prefix: &Prefix, names: &Keys) -> Result<Self, KeyError> {
+        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| prefix.key(name(names, input)));
+        Ok(Self { keys: [scan?, odom?, tf?, tf_static?] })
+    }
+
+    /// The key of an input.
+    #[must_use]
+    pub const fn of(&self, input: Input) -> &OwnedKeyExpr {
+        let [scan, odom, tf, tf_static] = &self.keys;
+        match input {
+            Input::Scan => scan,
+            Input::Odom => odom,
+            Input::Tf => tf,
+            Input::TfStatic => tf_static,
+        }
+    }
+}
+
+fn name(names: &Keys, input: Input) -> &str {
+    match input {
+        Input::Scan => &names.scan,
+        Input::Odom => &names.odom,
+        Input::Tf => &names.tf,
+        Input::TfStatic => &names.tf_static,
+    }
+}
+
 fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
     let key = KeyExpr::autocanonize(text.to_owned())
         .map_err(|error| KeyError::Invalid { key: text.to_owned(), reason: error.to_string() })?;
@@ -65,6 +106,18 @@ fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn inputs_can_be_renamed() {
+        let names = Keys { scan: "front/scan".to_owned(), ..Keys::default() };
+        let keys = InputKeys::new(&Prefix::parse("robot01").unwrap(), &names).unwrap();
+        let keys = Input::ALL.map(|input| keys.of(input).to_string());
+        let expected = ["robot01/front/scan", "robot01/odom", "robot01/tf", "robot01/tf_static"];
+        assert_eq!(keys, expected);
+        let names = Keys { odom: "*".to_owned(), ..Keys::default() };
+        let error = InputKeys::new(&Prefix::parse("").unwrap(), &names).unwrap_err();
+        assert_eq!(error, KeyError::Wildcard("*".to_owned()));
+    }
 
     #[test]
     fn keys_are_under_the_prefix() {

@@ -1,6 +1,7 @@
 //! What became of every scan: a verdict each, counted.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use serde::Serialize;
 
@@ -85,22 +86,23 @@ pub struct Entry {
     pub detail: String,
 }
 
-/// The verdicts so far.
+/// The verdicts so far; cheap to copy, for every snapshot has one.
 #[derive(Debug, Clone, Default)]
 pub struct Ledger {
-    counts: BTreeMap<Verdict, u64>,
+    counts: Arc<BTreeMap<Verdict, u64>>,
     total: u64,
-    last: BTreeMap<Verdict, Entry>,
+    last: Arc<BTreeMap<Verdict, Entry>>,
 }
 
 impl Ledger {
     /// Enters a verdict and returns its entry.
     pub fn enter(&mut self, stamp: Option<Stamp>, verdict: Verdict, detail: String) -> &Entry {
-        *self.counts.entry(verdict).or_default() += 1;
+        *Arc::make_mut(&mut self.counts).entry(verdict).or_default() += 1;
         self.total += 1;
         let entry = Entry { number: self.total, stamp, verdict, detail };
-        self.last.insert(verdict, entry);
-        &self.last[&verdict]
+        let last = Arc::make_mut(&mut self.last);
+        last.insert(verdict, entry);
+        &last[&verdict]
     }
 
     /// How many scans had this verdict.
@@ -117,7 +119,7 @@ impl Ledger {
 
     /// The last entry of each verdict that occurred.
     #[must_use]
-    pub const fn last(&self) -> &BTreeMap<Verdict, Entry> {
+    pub fn last(&self) -> &BTreeMap<Verdict, Entry> {
         &self.last
     }
 }

@@ -1,7 +1,332 @@
 //! `gmapd run`: live mapping on a Zenoh mesh.
+//!
+//! What comes is handed on by Zenoh's callbacks ([`input`]), decoded by a task, and put in the
+//! [`mailbox`] of the filter's thread ([`mapper`]), which puts it in order ([`synchronizer`]),
+//! runs the filter, and leaves a [`snapshot`] and an entry in the [`ledger`] for each scan.
 
 pub mod command;
+pub mod frames;
+pub mod input;
+mod judgement;
 pub mod keys;
 pub mod ledger;
+pub mod mailbox;
+pub mod mapper;
 pub mod snapshot;
 pub mod status;
+pub mod synchronizer;
+
+use std::future::Future;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use thiserror::Error;
+use tokio::sync::{broadcast, mpsc, oneshot, watch};
+use tokio::task::JoinHandle;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::Locality;
+use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
+
+use self::command::Request;
+use self::input::{Inbox, Input};
+use self::keys::{InputKeys, KeyError, Prefix};
+use self::ledger::Entry;
+use self::mailbox::Mailbox;
+use self::mapper::{Connections, Gauges, Mapper};
+use self::snapshot::{Snapshot, State};
+use self::status::{Shared, Status, StatusSource};
+use crate::clock;
+use crate::config::Config;
+use crate::slam::gmapping::ThreadsError;
+
+/// At the end, what waits in the mailbox is worked off for this long.
+const DRAIN: Duration = Duration::from_millis(1400);
+
+/// How long anything else may take at the end.
+const CLOSE: Duration = Duration::from_millis(200);
+
+/// Verdicts that a slow listener may be behind.
+const VERDICTS_KEPT: usize = 1024;
+
+/// Commands on their way to the mailbox.
+const COMMANDS: usize = 16;
+
+/// Static transforms a publisher may have told before the daemon started.
+const STATIC_TRANSFORMS: usize = 100;
+
+/// How often the state is looked at, to log what changed.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// What to run.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// All about mapping.
+    pub config: Config,
+    /// What the robot's keys begin with.
+    pub prefix: Prefix,
+    /// Threads of the filter.
+    pub threads: usize,
+}
+
+/// Why the daemon does not run, or ended by itself.
+#[derive(Debug, Error)]
+pub enum DaemonError {
+    /// A key cannot be used.
+    #[error(transparent)]
+    Key(#[from] KeyError),
+    /// The filter's threads do not start.
+    #[error(transparent)]
+    Threads(#[from] ThreadsError),
+    /// The thread `mapper` does not start.
+    #[error("cannot start the thread that maps")]
+    Mapper(#[source] std::io::Error),
+    /// Zenoh takes no subscriber.
+    #[error("cannot subscribe to {key}")]
+    Subscribe {
+        /// The key.
+        key: String,
+        /// What Zenoh says.
+        source: zenoh::Error,
+    },
+    /// A bug: the thread `mapper` ended though nobody asked it to.
+    #[error("the thread that maps ended unexpectedly")]
+    MapperEnded,
+}
+
+/// Maps until `shutdown` resolves, and closes the session then.
+///
+/// # Errors
+/// When the daemon cannot start, or ends by itself.
+pub async fn run(
+    session: zenoh::Session,
+    settings: Settings,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), DaemonError> {
+    let mut daemon = Daemon::start(&session, settings).await?;
+    let ended = tokio::select! {
+        () = shutdown => Ok(()),
+        () = daemon.mapper_ended() => Err(DaemonError::MapperEnded),
+    };
+    daemon.stop().await;
+    // What it would still send is not worth waiting for.
+    tokio::time::timeout(CLOSE, session.close()).await.ok();
+    ended
+}
+
+/// A daemon that runs.
+#[derive(Debug)]
+pub struct Daemon {
+    /// `None` once undeclared.
+    subscribers: Option<Subscribers>,
+    inbox: Arc<Inbox>,
+    mailbox: Arc<Mailbox>,
+    decoder: JoinHandle<()>,
+    /// Ends with the thread `mapper`.
+    mapper: oneshot::Receiver<()>,
+    snapshots: watch::Receiver<Arc<Snapshot>>,
+    verdicts: broadcast::Sender<Entry>,
+    commands: mpsc::Sender<Request>,
+    status: Arc<StatusSource>,
+    helpers: [JoinHandle<()>; 2],
+}
+
+#[derive(Debug)]
+struct Subscribers {
+    changing: Vec<Subscriber<()>>,
+    constant: AdvancedSubscriber<()>,
+}
+
+impl Daemon {
+    /// Starts to listen and to map.
+    ///
+    /// # Errors
+    /// When a key cannot be used, or a thread does not start.
+    pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
+        let Settings { config, prefix, threads } = settings;
+        let keys = InputKeys::new(&prefix, &config.raw.keys)?;
+        let inbox = Arc::new(Inbox::default());
+        let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
+        let gauges = Arc::new(Mutex::new(Gauges::default()));
+        let (snapshot_sender, snapshots) = watch::channel(Arc::new(mapper::first_snapshot()));
+        let verdicts = broadcast::Sender::new(VERDICTS_KEPT);
+        let connections = Connections {
+            mailbox: Arc::clone(&mailbox),
+            inbox: Arc::clone(&inbox),
+            snapshots: snapshot_sender,
+            verdicts: verdicts.clone(),
+            gauges: Arc::clone(&gauges),
+        };
+        let mapper = spawn(Mapper::new(connections, &config, &keys, threads)?)?;
+        let decoder = tokio::spawn(input::decode(Arc::clone(&inbox), Arc::clone(&mailbox)));
+        let shared = Shared {
+            inbox: Arc::clone(&inbox),
+            mailbox: Arc::clone(&mailbox),
+            gauges,
+            snapshots: snapshots.clone(),
+        };
+        let status = Arc::new(StatusSource::new(keys.clone(), config.raw.seed, shared));
+        let (commands, requests) = mpsc::channel(COMMANDS);
+        let helpers = [
+            tokio::spawn(forward(requests, Arc::clone(&mailbox))),
+            tokio::spawn(log_changes(Arc::clone(&status))),
+        ];
+        // Here serving::start(...) begins: publishers and queryables, which take `snapshots`,
+        // `verdicts`, `commands` and `status`, before anything comes in.
+        let subscribers = subscribe(session, &keys, &inbox).await?;
+        tell_keys(&keys);
+        Ok(Self {
+            subscribers: Some(subscribers),
+            inbox,
+            mailbox,
+            decoder,
+            mapper,
+            snapshots,
+            verdicts,
+            commands,
+            status,
+            helpers,
+        })
+    }
+
+    /// What the filter knows.
+    #[must_use]
+    pub fn snapshots(&self) -> watch::Receiver<Arc<Snapshot>> {
+        self.snapshots.clone()
+    }
+
+    /// What becomes of each scan from now on.
+    #[must_use]
+    pub fn verdicts(&self) -> broadcast::Receiver<Entry> {
+        self.verdicts.subscribe()
+    }
+
+    /// Where commands go.
+    #[must_use]
+    pub fn commands(&self) -> mpsc::Sender<Request> {
+        self.commands.clone()
+    }
+
+    /// How it is.
+    #[must_use]
+    pub fn status(&self) -> Status {
+        self.status.status()
+    }
+
+    /// Resolves when the filter's thread has ended.
+    async fn mapper_ended(&mut self) {
+        // The sender is dropped with the thread, and never sends.
+        (&mut self.mapper).await.ok();
+    }
+
+    /// Stops listening, works off what waits for a while, and leaves the last snapshot.
+    pub async fn stop(mut self) -> Arc<Snapshot> {
+        let deadline = clock::now() + DRAIN;
+        if let Some(subscribers) = self.subscribers.take() {
+            tokio::time::timeout(CLOSE, subscribers.undeclare()).await.ok();
+        }
+        self.inbox.close();
+        tokio::time::timeout(CLOSE, &mut self.decoder).await.ok();
+        self.mailbox.close(deadline);
+        if tokio::time::timeout_at(deadline.into(), self.mapper_ended()).await.is_err() {
+            tracing::warn!("the filter did not end in time; its last scans are lost");
+        }
+        self.helpers.iter().for_each(JoinHandle::abort);
+        // Here the map is saved, if save_on_exit says so, and serving stops.
+        self.snapshots.borrow().clone()
+    }
+}
+
+impl Drop for Daemon {
+    /// A daemon that is let go without having been stopped leaves no task behind.
+    fn drop(&mut self) {
+        self.inbox.close();
+        self.mailbox.close(clock::now());
+        self.helpers.iter().for_each(JoinHandle::abort);
+    }
+}
+
+impl Subscribers {
+    /// A session that is closed has none any more, which is as good.
+    async fn undeclare(self) {
+        for subscriber in self.changing {
+            subscriber.undeclare().await.ok();
+        }
+        self.constant.undeclare().await.ok();
+    }
+}
+
+/// Starts the thread; the receiver ends with it, even if it panics.
+fn spawn(mapper: Mapper) -> Result<oneshot::Receiver<()>, DaemonError> {
+    let (alive, ended) = oneshot::channel();
+    let work = move || {
+        let _alive: oneshot::Sender<()> = alive;
+        mapper.run();
+    };
+    let thread = std::thread::Builder::new().name("mapper".to_owned());
+    thread.spawn(work).map_err(DaemonError::Mapper)?;
+    Ok(ended)
+}
+
+async fn subscribe(
+    session: &zenoh::Session,
+    keys: &InputKeys,
+    inbox: &Arc<Inbox>,
+) -> Result<Subscribers, DaemonError> {
+    let failed = |input| {
+        let key = keys.of(input).to_string();
+        move |source| DaemonError::Subscribe { key, source }
+    };
+    let mut changing = Vec::new();
+    for input in [Input::Tf, Input::Odom, Input::Scan] {
+        // Our own transforms leave on the key on which others come in.
+        let origin = if input == Input::Tf { Locality::Remote } else { Locality::Any };
+        let inbox = Arc::clone(inbox);
+        let subscriber = session
+            .declare_subscriber(keys.of(input))
+            .allowed_origin(origin)
+            .callback(move |sample| inbox.receive(input, &sample));
+        changing.push(subscriber.await.map_err(failed(input))?);
+    }
+    let inbox = Arc::clone(inbox);
+    let history = HistoryConfig::default().detect_late_publishers().max_samples(STATIC_TRANSFORMS);
+    let constant = session
+        .declare_subscriber(keys.of(Input::TfStatic))
+        .callback(move |sample| inbox.receive(Input::TfStatic, &sample))
+        .history(history)
+        .await
+        .map_err(failed(Input::TfStatic))?;
+    Ok(Subscribers { changing, constant })
+}
+
+fn tell_keys(keys: &InputKeys) {
+    tracing::info!(
+        "waiting for scans on {}, odometry on {} or {}, static transforms on {}",
+        keys.of(Input::Scan),
+        keys.of(Input::Odom),
+        keys.of(Input::Tf),
+        keys.of(Input::TfStatic)
+    );
+}
+
+async fn forward(mut requests: mpsc::Receiver<Request>, mailbox: Arc<Mailbox>) {
+    while let Some(request) = requests.recv().await {
+        mailbox.ask(request);
+    }
+}
+
+/// Tells the operator when the state changes.
+async fn log_changes(source: Arc<StatusSource>) {
+    let mut last = None;
+    loop {
+        tokio::time::sleep(LOOK).await;
+        let (state, detail) = source.state();
+        if last.replace(state) != Some(state) {
+            match state {
+                State::Mapping | State::Paused => tracing::info!(?state, "{detail}"),
+                State::WaitingForScans | State::WaitingForOdometry | State::Degraded => {
+                    tracing::warn!(?state, "{detail}");
+                }
+            }
+        }
+    }
+}

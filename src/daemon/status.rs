@@ -1,13 +1,24 @@
 //! What `slam/status` tells: the one answer to "why does my map not grow?".
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 use serde::Serialize;
+use tokio::sync::watch;
 
+use super::input::{Inbox, Input};
+use super::judgement::{self, Circumstances};
+use super::keys::InputKeys;
 use super::ledger::Verdict;
-use super::snapshot::State;
+use super::mailbox::Mailbox;
+use super::mapper::Gauges;
+use super::snapshot::{MapVersion, Snapshot, State};
+use super::synchronizer::Channel;
+use crate::clock;
 use crate::slam::pose::Pose2;
 use crate::statistics::Spread;
+use crate::timeline::TimelineCounts;
 
 /// How the daemon is, at the moment of asking.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,7 +64,7 @@ pub struct InputStatus {
     pub received: u64,
     /// Samples whose bytes were not what was expected.
     pub rejected: u64,
-    /// Samples dropped because they came faster than they could be decoded.
+    /// Samples dropped because they came faster than they could be taken.
     pub dropped: u64,
     /// What was wrong with the last that was rejected.
     pub last_rejection: Option<String>,
@@ -95,4 +106,167 @@ pub struct MapStatus {
     pub known_area_m2: f64,
     /// Processed scans in it.
     pub scans: usize,
+}
+
+/// Where the status comes from.
+#[derive(Debug)]
+pub struct StatusSource {
+    started: Instant,
+    keys: InputKeys,
+    seed: u64,
+    inbox: Arc<Inbox>,
+    mailbox: Arc<Mailbox>,
+    gauges: Arc<Mutex<Gauges>>,
+    snapshots: watch::Receiver<Arc<Snapshot>>,
+    /// Of the version of the map that was asked for last.
+    map: Mutex<Option<MapStatus>>,
+}
+
+/// What the daemon's parts share.
+#[derive(Debug, Clone)]
+pub(super) struct Shared {
+    pub(super) inbox: Arc<Inbox>,
+    pub(super) mailbox: Arc<Mailbox>,
+    pub(super) gauges: Arc<Mutex<Gauges>>,
+    pub(super) snapshots: watch::Receiver<Arc<Snapshot>>,
+}
+
+impl StatusSource {
+    pub(super) fn new(keys: InputKeys, seed: u64, shared: Shared) -> Self {
+        let Shared { inbox, mailbox, gauges, snapshots } = shared;
+        let (started, map) = (clock::now(), Mutex::default());
+        Self { started, keys, seed, inbox, mailbox, gauges, snapshots, map }
+    }
+
+    /// What the daemon is doing now, in a word and a sentence.
+    #[must_use]
+    pub fn state(&self) -> (State, String) {
+        let (snapshot, gauges) = self.present();
+        self.judge(&self.inputs(&gauges), &snapshot, &gauges)
+    }
+
+    fn present(&self) -> (Arc<Snapshot>, Gauges) {
+        let gauges = self.gauges.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        (Arc::clone(&self.snapshots.borrow()), gauges)
+    }
+
+    fn judge(
+        &self,
+        inputs: &BTreeMap<&'static str, InputStatus>,
+        snapshot: &Snapshot,
+        gauges: &Gauges,
+    ) -> (State, String) {
+        let uptime_s = self.uptime_s();
+        judgement::judge(&Circumstances { uptime_s, inputs, snapshot, gauges })
+    }
+
+    fn uptime_s(&self) -> f64 {
+        clock::now().duration_since(self.started).as_secs_f64()
+    }
+
+    /// How the daemon is now.
+    #[must_use]
+    pub fn status(&self) -> Status {
+        let (snapshot, gauges) = self.present();
+        let inputs = self.inputs(&gauges);
+        let (state, detail) = self.judge(&inputs, &snapshot, &gauges);
+        let ledger = &snapshot.ledger;
+        let details = ledger.last().iter().filter(|(_, entry)| !entry.detail.is_empty());
+        Status {
+            version: env!("CARGO_PKG_VERSION"),
+            uptime_s: self.uptime_s(),
+            state,
+            detail,
+            pose_in_map: snapshot.estimate.pose_in_map,
+            scans: Verdict::ALL.into_iter().map(|v| (v, ledger.count(v))).collect(),
+            last_details: details.map(|(v, entry)| (*v, entry.detail.clone())).collect(),
+            inputs,
+            milliseconds_per_scan: snapshot.milliseconds_per_scan,
+            real_time_factor: (gauges.worked_s > 0.0).then(|| gauges.mapped_s / gauges.worked_s),
+            scans_waiting: self.mailbox.scans() + gauges.scans_waiting,
+            filter: filter_status(&snapshot, &gauges),
+            map: snapshot.map.as_deref().map(|map| self.map_status(map)),
+            peak_memory_bytes: clock::peak_resident_memory(),
+            seed: self.seed,
+        }
+    }
+
+    fn inputs(&self, gauges: &Gauges) -> BTreeMap<&'static str, InputStatus> {
+        let status = |input| (Input::name(input), self.input(input, gauges));
+        Input::ALL.into_iter().map(status).collect()
+    }
+
+    fn input(&self, input: Input, gauges: &Gauges) -> InputStatus {
+        let tally = self.inbox.tally(input);
+        let now = clock::now();
+        let lost = if input == Input::Odom { self.mailbox.lost_motions() } else { 0 };
+        let status = InputStatus {
+            key: self.keys.of(input).to_string(),
+            received: tally.received,
+            rejected: tally.rejected,
+            dropped: tally.dropped + lost,
+            last_rejection: tally.last_rejection,
+            age_s: tally.last.map(|last| now.saturating_duration_since(last).as_secs_f64()),
+            ..InputStatus::default()
+        };
+        match input {
+            Input::Scan => InputStatus {
+                duplicates: gauges.scans.duplicates,
+                reordered: gauges.scans.reordered,
+                clock_restarts: gauges.scans.clock_restarts,
+                ..status
+            },
+            Input::Odom if gauges.channel == Some(Channel::Messages) => {
+                with_counts(status, gauges.odometry)
+            }
+            Input::Tf => with_counts(status, gauges.transforms.samples),
+            Input::Odom | Input::TfStatic => status,
+        }
+    }
+
+    /// Cropping the map costs milliseconds, so it is done once a version.
+    fn map_status(&self, map: &MapVersion) -> MapStatus {
+        let mut known = self.map.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(status) = known.as_ref().filter(|status| status.version == map.version) {
+            return status.clone();
+        }
+        known.insert(MapStatus::of(map)).clone()
+    }
+}
+
+impl MapStatus {
+    fn of(map: &MapVersion) -> Self {
+        let (version, scans) = (map.version, map.path.len());
+        let Some(grid) = map.occupancy.to_grid(map.occupied_threshold) else {
+            return Self { version, scans, ..Self::default() };
+        };
+        let known = grid.cells.iter().filter(|cell| **cell >= 0).count();
+        Self {
+            version,
+            width: grid.width,
+            height: grid.height,
+            resolution: grid.resolution,
+            known_area_m2: known as f64 * grid.resolution * grid.resolution,
+            scans,
+        }
+    }
+}
+
+fn with_counts(status: InputStatus, counts: TimelineCounts) -> InputStatus {
+    InputStatus {
+        duplicates: counts.duplicates,
+        reordered: counts.reordered + counts.stale,
+        clock_restarts: counts.restarts,
+        ..status
+    }
+}
+
+fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
+    let report = snapshot.estimate.report.as_ref();
+    FilterStatus {
+        particles: snapshot.estimate.particles.len(),
+        effective_sample_size: report.map(|report| report.effective_sample_size),
+        resamples: snapshot.resamples,
+        odometry_jumps: gauges.odometry_jumps,
+    }
 }

@@ -190,6 +190,34 @@ impl GMapping {
         })
     }
 
+    /// Forgets map and trajectories, as if nothing had been read: the next scan is the first, at
+    /// `initial_pose` in `map`, or where odometry says.
+    pub fn reset(&mut self, initial_pose: Option<Pose2>) {
+        self.parameters.initial_pose = initial_pose;
+        self.particles.clear();
+        self.best = 0;
+        self.tree = TrajectoryTree::default();
+        self.output = OutputMap::new(self.parameters.resolution);
+        self.odometry = Odometry::default();
+        self.stamps.clear();
+        self.scans_seen = 0;
+    }
+
+    /// Says where the base is in `map`: before the first scan, where the map begins; later, all
+    /// particles are moved and turned together, so that the best one's pose is this one.
+    ///
+    /// Maps and trajectories stay where they are.
+    pub fn set_pose(&mut self, pose_in_map: Pose2) {
+        if self.particles.is_empty() {
+            self.parameters.initial_pose = Some(pose_in_map);
+            return;
+        }
+        let moved = pose_in_map * self.pose_in_map().inverse();
+        for particle in &mut self.particles {
+            particle.pose_in_map = moved * particle.pose_in_map;
+        }
+    }
+
     /// Takes an odometry reading: the base in `odom`.
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         if !self.parameters.jump.is_usable(odom_from_base) {

@@ -76,7 +76,8 @@ impl Default for JumpGuard {
 
 impl JumpGuard {
     /// Whether a step is to be taken out.
-    pub(super) fn rejects(&self, step: Pose2) -> bool {
+    #[must_use]
+    pub fn rejects(&self, step: Pose2) -> bool {
         self.policy == JumpPolicy::Reject && step.position().norm() > self.max_step
     }
 

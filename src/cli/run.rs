@@ -1,0 +1,153 @@
+//! `gmapd run`: the daemon, until a signal ends it.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::Args;
+use gmapd::config::Config;
+use gmapd::daemon::keys::Prefix;
+use gmapd::daemon::{self, Settings};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+use super::session::SessionArguments;
+
+/// What is logged if nothing is said: Zenoh tells more than an operator wants to know.
+const LOG_FILTER: &str = "warn,gmapd=info";
+
+/// Exit code of a process that a second Ctrl-C ended, as shells count it.
+const INTERRUPTED: i32 = 130;
+
+/// What to map, and where the mesh is.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+    Maps what a robot sends on PREFIX/scan (sensor_msgs/LaserScan) and PREFIX/odom\n\
+    (nav_msgs/Odometry), or PREFIX/tf instead of odom, as ROS 2 CDR or as JSON.\n\
+    The laser's place on the robot comes from PREFIX/tf_static or from laser in the configuration.\n\
+    Ctrl-C or SIGTERM ends it; a second one ends it at once.\n\n\
+    GMAPD_LOG (or RUST_LOG) says what is logged to stderr, as in GMAPD_LOG=gmapd=debug.\n\n\
+    Examples:\n  \
+        gmapd run --prefix robot01                     on the local network\n  \
+        gmapd run --prefix robot01 -e tcp/10.0.0.1:7447\n                                                 \
+        through a router\n  \
+        gmapd run --config config/gmapd.yaml --set laser='{x: 0.2}' -l tcp/0.0.0.0:7447\n\n\
+    Then, from anywhere on the mesh:\n  \
+        gmapd get robot01 status                       what it does, and why the map does not grow\n\n\
+    Exit codes: 0 ended by a signal, 1 failed, 2 wrong usage, 130 ended by a second signal.")]
+pub(crate) struct Arguments {
+    /// Configuration, or a parameter file of slam_gmapping; slam_gmapping's defaults without
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// What the robot's keys begin with; the same as --set prefix=ROBOT
+    #[arg(long, value_name = "ROBOT")]
+    prefix: Option<String>,
+    /// Set a key of the configuration; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Seed of the random numbers; the same as --set seed=N
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Threads of the filter; one a processor without. The result is the same for any number
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    mesh: SessionArguments,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    start_log()?;
+    let settings = settings(arguments)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .thread_name("daemon")
+        .enable_all()
+        .build()
+        .context("cannot start the threads of the daemon")?;
+    runtime.block_on(until_signalled(settings, &arguments.mesh))
+}
+
+fn start_log() -> anyhow::Result<()> {
+    let set = ["GMAPD_LOG", "RUST_LOG"].into_iter().find_map(|name| {
+        let directives = std::env::var(name).ok()?;
+        Some(EnvFilter::try_new(directives).with_context(|| format!("{name} is no log filter")))
+    });
+    let filter = set.unwrap_or_else(|| Ok(EnvFilter::new(LOG_FILTER)))?;
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    Ok(())
+}
+
+fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
+    let mut overrides = arguments.set.clone();
+    overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
+    let config = Config::load(arguments.config.as_deref(), &overrides)?;
+    for warning in &config.warnings {
+        tracing::warn!("{warning}");
+    }
+    if cfg!(debug_assertions) {
+        tracing::warn!("this is a debug build, many times slower than a release build");
+    }
+    let prefix = Prefix::parse(arguments.prefix.as_deref().unwrap_or(&config.raw.prefix))?;
+    let threads = arguments.threads.map_or_else(std::thread::available_parallelism, Ok);
+    // A system that does not say has one.
+    let threads = threads.map_or(1, NonZeroUsize::get);
+    Ok(Settings { config, prefix, threads })
+}
+
+async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow::Result<()> {
+    let mut signals = Signals::listen()?;
+    if !mesh.endpoints().is_empty() {
+        tracing::info!("connecting to {}", mesh.endpoints().join(", "));
+    }
+    let session = tokio::select! {
+        session = mesh.open_when_reachable() => session?,
+        () = signals.next() => return Ok(()),
+    };
+    let robot = settings.prefix.to_string();
+    tell_where(&session, &robot).await;
+    let shutdown = async move {
+        signals.next().await;
+        tracing::info!("ending; a second signal ends at once");
+        tokio::spawn(async move {
+            signals.next().await;
+            std::process::exit(INTERRUPTED);
+        });
+    };
+    daemon::run(session, settings, shutdown).await?;
+    Ok(())
+}
+
+async fn tell_where(session: &zenoh::Session, robot: &str) {
+    let locators: Vec<String> =
+        session.info().locators().await.iter().map(ToString::to_string).collect();
+    if locators.is_empty() {
+        tracing::info!("gmapd {} is a client of the mesh", env!("CARGO_PKG_VERSION"));
+    } else {
+        let locators = locators.join(", ");
+        tracing::info!("gmapd {} listens on {locators}", env!("CARGO_PKG_VERSION"));
+    }
+    let robot = if robot.is_empty() { String::new() } else { format!("{robot} ") };
+    tracing::info!("how it goes: gmapd get {robot}status");
+}
+
+/// What ends the daemon.
+struct Signals {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl Signals {
+    fn listen() -> anyhow::Result<Self> {
+        let listen = |kind| signal(kind).context("cannot listen to signals");
+        Ok(Self {
+            interrupt: listen(SignalKind::interrupt())?,
+            terminate: listen(SignalKind::terminate())?,
+        })
+    }
+
+    async fn next(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! How a subcommand gets onto the mesh.
+
+use std::path::PathBuf;
+
+use anyhow::{Context as _, anyhow};
+use clap::Args;
+
+/// Where the mesh is.
+///
+/// Without arguments the session is a peer that finds others on the local network.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Mesh")]
+pub(crate) struct SessionArguments {
+    /// Zenoh's configuration, JSON5; the two arguments below come on top
+    #[arg(long, value_name = "FILE")]
+    zenoh: Option<PathBuf>,
+    /// Connect as a client, as to tcp/192.168.1.5:7447 (with --listen as a peer); may be repeated
+    #[arg(short = 'e', long, value_name = "ENDPOINT")]
+    connect: Vec<String>,
+    /// Listen there as a peer, as on tcp/0.0.0.0:7447; may be repeated
+    #[arg(short, long, value_name = "ENDPOINT")]
+    listen: Vec<String>,
+}
+
+impl SessionArguments {
+    /// Opens the session; nobody answering at `--connect` is an error.
+    ///
+    /// Zenoh needs tokio's multi-thread runtime.
+    pub(crate) async fn open(&self) -> anyhow::Result<zenoh::Session> {
+        self.open_with(self.config()?).await
+    }
+
+    /// Opens the session as soon as one of `--connect` answers, however long that takes.
+    pub(crate) async fn open_when_reachable(&self) -> anyhow::Result<zenoh::Session> {
+        let mut config = self.config()?;
+        if !self.connect.is_empty() {
+            insert(&mut config, "connect/timeout_ms", "-1")?;
+        }
+        self.open_with(config).await
+    }
+
+    /// What `--connect` says, for messages.
+    pub(crate) fn endpoints(&self) -> &[String] {
+        &self.connect
+    }
+
+    async fn open_with(&self, config: zenoh::Config) -> anyhow::Result<zenoh::Session> {
+        zenoh::open(config).await.map_err(|error| {
+            let error = anyhow!(error);
+            if self.connect.is_empty() {
+                error.context("cannot open a Zenoh session")
+            } else {
+                error.context(format!(
+                    "cannot open a Zenoh session; does anybody listen at {}?",
+                    self.connect.join(", ")
+                ))
+            }
+        })
+    }
+
+    fn config(&self) -> anyhow::Result<zenoh::Config> {
+        let mut config = match &self.zenoh {
+            Some(path) => zenoh::Config::from_file(path).map_err(|error| {
+                anyhow!(error)
+                    .context(format!("cannot use Zenoh's configuration {}", path.display()))
+            })?,
+            None => zenoh::Config::default(),
+        };
+        if !self.connect.is_empty() {
+            insert(&mut config, "connect/endpoints", &json(&self.connect)?)?;
+            // Two peers that share only a router do not hear each other; clients do.
+            insert(&mut config, "mode", "\"client\"")?;
+        }
+        if !self.listen.is_empty() {
+            insert(&mut config, "listen/endpoints", &json(&self.listen)?)?;
+            insert(&mut config, "mode", "\"peer\"")?;
+        }
+        Ok(config)
+    }
+}
+
+fn json(endpoints: &[String]) -> anyhow::Result<String> {
+    serde_json::to_string(endpoints).context("endpoints are text")
+}
+
+fn insert(config: &mut zenoh::Config, key: &str, value: &str) -> anyhow::Result<()> {
+    config
+        .insert_json5(key, value)
+        .map_err(|error| anyhow!(error).context(format!("Zenoh does not take {value} as {key}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(connect: &[&str], listen: &[&str]) -> anyhow::Result<zenoh::Config> {
+        let texts = |texts: &[&str]| texts.iter().map(|&text| text.to_owned()).collect();
+        SessionArguments { zenoh: None, connect: texts(connect), listen: texts(listen) }.config()
+    }
+
+    #[test]
+    fn connecting_makes_a_client_and_listening_a_peer() {
+        let mode = |connect: &[&str], listen: &[&str]| {
+            config(connect, listen).unwrap().get_json("mode").unwrap()
+        };
+        assert_eq!(mode(&["tcp/127.0.0.1:7447"], &[]), "\"client\"");
+        assert_eq!(mode(&[], &["tcp/127.0.0.1:0"]), "\"peer\"");
+        assert_eq!(mode(&["tcp/127.0.0.1:7447"], &["tcp/127.0.0.1:0"]), "\"peer\"");
+    }
+
+    #[test]
+    fn endpoints_are_those_that_were_given() {
+        let config = config(&["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"], &[]).unwrap();
+        let endpoints = config.get_json("connect/endpoints").unwrap();
+        assert_eq!(endpoints, r#"["tcp/10.0.0.1:7447","tcp/10.0.0.2:7447"]"#);
+    }
+
+    #[test]
+    fn what_is_no_endpoint_is_named() {
+        let error = format!("{:#}", config(&["router"], &[]).unwrap_err());
+        assert!(error.contains(r#"["router"]"#), "{error}");
+    }
+}

@@ -1,0 +1,342 @@
+//! What comes from the mesh: handed on by callbacks that never wait, and decoded by a task.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use tokio::sync::Notify;
+use zenoh::bytes::ZBytes;
+use zenoh::sample::{Sample, SampleKind};
+
+use super::ledger::Verdict;
+use super::mailbox::{Mail, Mailbox};
+use super::synchronizer::{FramedScan, Refusal};
+use crate::slam::pose::Stamp;
+use crate::tf::Kind;
+use crate::{clock, convert, ros};
+
+/// Payloads above this are not looked at: a sweep of 10000 beams has less than a tenth of it.
+const LARGEST_PAYLOAD: usize = 4 << 20;
+
+/// Bytes of one input that may wait to be decoded.
+const MOST_BYTES: usize = 32 << 20;
+
+/// Scans that may wait to be decoded.
+const MOST_SCANS: usize = 64;
+
+/// Other samples that may wait to be decoded.
+const MOST_OTHERS: usize = 4096;
+
+/// What is listened to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Input {
+    /// `sensor_msgs/LaserScan`.
+    Scan,
+    /// `nav_msgs/Odometry`.
+    Odom,
+    /// `tf2_msgs/TFMessage`, of frames that move.
+    Tf,
+    /// `tf2_msgs/TFMessage`, of frames that do not.
+    TfStatic,
+}
+
+impl Input {
+    /// All inputs.
+    pub const ALL: [Self; 4] = [Self::Scan, Self::Odom, Self::Tf, Self::TfStatic];
+
+    /// Its name in the configuration and the status.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Scan => "scan",
+            Self::Odom => "odom",
+            Self::Tf => "tf",
+            Self::TfStatic => "tf_static",
+        }
+    }
+
+    const fn most_waiting(self) -> usize {
+        match self {
+            Self::Scan => MOST_SCANS,
+            Self::Odom | Self::Tf | Self::TfStatic => MOST_OTHERS,
+        }
+    }
+}
+
+/// How much came of an input, and what of it could not be used.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tally {
+    /// Samples that came.
+    pub received: u64,
+    /// Samples that are not what was expected.
+    pub rejected: u64,
+    /// Samples dropped because they came faster than they could be decoded.
+    pub dropped: u64,
+    /// What was wrong with the last that was rejected.
+    pub last_rejection: Option<String>,
+    /// When the last came.
+    pub last: Option<Instant>,
+}
+
+/// A sample as it came.
+#[derive(Debug, Clone)]
+struct Raw {
+    /// In the order of arrival, over all inputs.
+    number: u64,
+    content: Content,
+    encoding: String,
+}
+
+/// What a sample holds.
+#[derive(Debug, Clone)]
+enum Content {
+    Payload(ZBytes),
+    /// So many bytes that they were let go.
+    TooLarge(usize),
+    /// Nothing: it says that there is nothing any more.
+    Deleted,
+}
+
+impl Content {
+    fn of(sample: &Sample) -> Self {
+        let length = sample.payload().len();
+        match sample.kind() {
+            SampleKind::Delete => Self::Deleted,
+            SampleKind::Put if length > LARGEST_PAYLOAD => Self::TooLarge(length),
+            SampleKind::Put => Self::Payload(sample.payload().clone()),
+        }
+    }
+
+    fn len(&self) -> usize {
+        match self {
+            Self::Payload(payload) => payload.len(),
+            Self::TooLarge(_) | Self::Deleted => 0,
+        }
+    }
+}
+
+#[derive(Debug, Default)]
+struct Queue {
+    raw: VecDeque<Raw>,
+    bytes: usize,
+    tally: Tally,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    queues: BTreeMap<Input, Queue>,
+    arrivals: u64,
+    /// Scans dropped that have had no verdict.
+    lost_scans: u64,
+    closed: bool,
+}
+
+/// What came and is not decoded yet, and how much came.
+#[derive(Debug, Default)]
+pub struct Inbox {
+    state: Mutex<State>,
+    changed: Notify,
+}
+
+enum Next {
+    Sample(Input, Raw),
+    /// One was dropped before it was decoded.
+    LostScan,
+}
+
+impl Inbox {
+    /// Takes a sample as it came. Never waits longer than it takes to move it.
+    pub fn receive(&self, input: Input, sample: &Sample) {
+        self.put(input, Content::of(sample), sample.encoding().to_string());
+    }
+
+    fn put(&self, input: Input, content: Content, encoding: String) {
+        let mut state = self.lock();
+        state.arrivals += 1;
+        let number = state.arrivals;
+        let queue = state.queues.entry(input).or_default();
+        queue.tally.received += 1;
+        queue.tally.last = Some(clock::now());
+        queue.bytes += content.len();
+        queue.raw.push_back(Raw { number, content, encoding });
+        let dropped = queue.make_room(input.most_waiting());
+        queue.tally.dropped += dropped;
+        if input == Input::Scan {
+            state.lost_scans += dropped;
+        }
+        drop(state);
+        self.changed.notify_one();
+    }
+
+    /// Counts a sample that cannot be used.
+    pub fn reject(&self, input: Input, reason: String) {
+        tracing::debug!(input = input.name(), reason, "rejected a message");
+        let mut state = self.lock();
+        let tally = &mut state.queues.entry(input).or_default().tally;
+        tally.rejected += 1;
+        tally.last_rejection = Some(reason);
+    }
+
+    /// How much came.
+    #[must_use]
+    pub fn tally(&self, input: Input) -> Tally {
+        self.lock().queues.get(&input).map(|queue| queue.tally.clone()).unwrap_or_default()
+    }
+
+    /// Nothing comes any more.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_one();
+    }
+
+    /// Waits for the next sample in the order of arrival; `None` when nothing comes any more.
+    async fn next(&self) -> Option<Next> {
+        loop {
+            {
+                let mut state = self.lock();
+                if let Some(next) = state.next() {
+                    return Some(next);
+                }
+                if state.closed {
+                    return None;
+                }
+            }
+            // One permit is kept, so that nothing is missed between the look and the wait.
+            self.changed.notified().await;
+        }
+    }
+
+    /// A panic of another thread leaves the queues as they were between two operations.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Queue {
+    /// Drops the oldest until few enough are left, and tells how many that were.
+    fn make_room(&mut self, most: usize) -> u64 {
+        let mut dropped = 0;
+        while self.raw.len() > most || self.bytes > MOST_BYTES {
+            let Some(oldest) = self.raw.pop_front() else { break };
+            self.bytes -= oldest.content.len();
+            dropped += 1;
+        }
+        dropped
+    }
+}
+
+impl State {
+    fn next(&mut self) -> Option<Next> {
+        if self.lost_scans > 0 {
+            self.lost_scans -= 1;
+            return Some(Next::LostScan);
+        }
+        let first = |queue: &Queue| queue.raw.front().map(|raw| raw.number);
+        let waiting = self.queues.iter().filter_map(|(input, queue)| Some((first(queue)?, *input)));
+        let (_, input) = waiting.min()?;
+        let queue = self.queues.get_mut(&input)?;
+        let raw = queue.raw.pop_front()?;
+        queue.bytes -= raw.content.len();
+        Some(Next::Sample(input, raw))
+    }
+}
+
+/// Decodes what comes until nothing comes any more.
+pub async fn decode(inbox: Arc<Inbox>, mailbox: Arc<Mailbox>) {
+    while let Some(next) = inbox.next().await {
+        match next {
+            Next::LostScan => {
+                let detail = "scans came faster than they could be decoded".to_owned();
+                mailbox.refuse(Refusal { stamp: None, verdict: Verdict::Overload, detail });
+            }
+            Next::Sample(input, raw) => {
+                let decoder = Decoder { inbox: &inbox, mailbox: &mailbox, encoding: &raw.encoding };
+                decoder.take(input, &raw.content);
+            }
+        }
+    }
+}
+
+/// Puts what a payload says in the mailbox, or counts that it says nothing.
+struct Decoder<'a> {
+    inbox: &'a Inbox,
+    mailbox: &'a Mailbox,
+    encoding: &'a str,
+}
+
+impl Decoder<'_> {
+    fn take(&self, input: Input, content: &Content) {
+        let reason = match content {
+            Content::Payload(payload) => return self.decode(input, &payload.to_bytes()),
+            Content::TooLarge(length) => {
+                format!("the payload has {length} bytes; at most {LARGEST_PAYLOAD} are read")
+            }
+            Content::Deleted => "it is a delete, which is no message".to_owned(),
+        };
+        match input {
+            Input::Scan => self.refuse(None, Verdict::NotDecodable, reason),
+            Input::Odom | Input::Tf | Input::TfStatic => self.inbox.reject(input, reason),
+        }
+    }
+
+    fn decode(&self, input: Input, bytes: &[u8]) {
+        match input {
+            Input::Scan => self.scan(bytes),
+            Input::Odom => self.odometry(bytes),
+            Input::Tf => self.transforms(bytes, Kind::Dynamic),
+            Input::TfStatic => self.transforms(bytes, Kind::Static),
+        }
+    }
+
+    fn scan(&self, bytes: &[u8]) {
+        let message = match ros::decode::<ros::LaserScan>(bytes, self.encoding) {
+            Ok(message) => message,
+            Err(error) => return self.refuse(None, Verdict::NotDecodable, error.to_string()),
+        };
+        let frame = message.header.frame_id.clone();
+        let stamp = convert::stamp(message.header.stamp).ok();
+        match convert::scan(message) {
+            Ok(scan) => self.mailbox.put(Mail::Scan(FramedScan { scan, frame })),
+            Err(error) => self.refuse(stamp, Verdict::BadGeometry, error.to_string()),
+        }
+    }
+
+    fn refuse(&self, stamp: Option<Stamp>, verdict: Verdict, detail: String) {
+        self.inbox.reject(Input::Scan, detail.clone());
+        self.mailbox.refuse(Refusal { stamp, verdict, detail });
+    }
+
+    fn odometry(&self, bytes: &[u8]) {
+        let decoded = ros::decode::<ros::Odometry>(bytes, self.encoding);
+        let sample = decoded
+            .map_err(|error| error.to_string())
+            .and_then(|message| convert::odometry(message).map_err(|error| error.to_string()));
+        match sample {
+            Ok(sample) => self.mailbox.put(Mail::Odometry(sample.stamp, sample.odom_from_base)),
+            Err(reason) => self.inbox.reject(Input::Odom, reason),
+        }
+    }
+
+    fn transforms(&self, bytes: &[u8], kind: Kind) {
+        let input = input_of(kind);
+        let message = match ros::decode::<ros::TfMessage>(bytes, self.encoding) {
+            Ok(message) => message,
+            Err(error) => return self.inbox.reject(input, error.to_string()),
+        };
+        for transform in message.transforms {
+            match convert::transform(transform) {
+                Ok(transform) => self.mailbox.put(Mail::Transform(transform, kind)),
+                Err(error) => self.inbox.reject(input, error.to_string()),
+            }
+        }
+    }
+}
+
+/// Where transforms of a kind come from.
+#[must_use]
+pub const fn input_of(kind: Kind) -> Input {
+    match kind {
+        Kind::Static => Input::TfStatic,
+        Kind::Dynamic => Input::Tf,
+    }
+}

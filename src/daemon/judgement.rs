@@ -1,0 +1,231 @@
+//! Why the map grows or does not, in a word and a sentence.
+
+use std::collections::BTreeMap;
+
+use super::ledger::Verdict;
+use super::mapper::Gauges;
+use super::snapshot::{Snapshot, State};
+use super::status::InputStatus;
+
+/// Scans that come less often than this, s, have stopped coming.
+const SCANS_STOPPED_S: f64 = 3.0;
+
+/// Of the last scans, the share that may be dropped before that is told.
+const BEARABLE_OVERLOAD: f64 = 0.1;
+
+/// Of the last scans, the share that has to have the same trouble for it to be told.
+const MOSTLY: f64 = 0.5;
+
+/// Processed scans that tell whether scans match.
+const MATCHES: usize = 10;
+
+/// What the judgement depends on.
+#[derive(Debug)]
+pub(super) struct Circumstances<'a> {
+    pub(super) uptime_s: f64,
+    pub(super) inputs: &'a BTreeMap<&'static str, InputStatus>,
+    pub(super) snapshot: &'a Snapshot,
+    pub(super) gauges: &'a Gauges,
+}
+
+/// What the daemon is doing, and what to do where something is wrong.
+pub(super) fn judge(now: &Circumstances<'_>) -> (State, String) {
+    if now.snapshot.paused {
+        return (State::Paused, "mapping is paused; slam/cmd/resume goes on".to_owned());
+    }
+    waiting_for_scans(now)
+        .or_else(|| waiting_for_odometry(now))
+        .or_else(|| unusable_scans(now))
+        .or_else(|| overload(now))
+        .or_else(|| no_match(now))
+        .unwrap_or_else(|| mapping(now))
+}
+
+fn waiting_for_scans(now: &Circumstances<'_>) -> Option<(State, String)> {
+    let scan = now.inputs.get("scan")?;
+    let key = &scan.key;
+    let detail = match scan.age_s {
+        None => format!(
+            "no scan has come on {key} in {:.1} s; does the laser publish there, and is it on the \
+             same mesh? `gmapd doctor` looks closer",
+            now.uptime_s
+        ),
+        Some(age_s) if age_s > SCANS_STOPPED_S => format!(
+            "no scan has come on {key} for {age_s:.1} s, after {} before; does the laser still run?",
+            scan.received
+        ),
+        Some(_) => return None,
+    };
+    Some((State::WaitingForScans, detail))
+}
+
+fn waiting_for_odometry(now: &Circumstances<'_>) -> Option<(State, String)> {
+    if let Some(detail) = troubled(now, &[Verdict::NoOdometry], MOSTLY) {
+        return Some((State::WaitingForOdometry, detail));
+    }
+    if now.snapshot.ledger.total() > 0 || now.gauges.scans_waiting == 0 {
+        return None;
+    }
+    Some((State::WaitingForOdometry, "the first scan waits for its odometry".to_owned()))
+}
+
+fn unusable_scans(now: &Circumstances<'_>) -> Option<(State, String)> {
+    const UNUSABLE: [Verdict; 8] = [
+        Verdict::NoMount,
+        Verdict::TiltedMount,
+        Verdict::NotDecodable,
+        Verdict::BadGeometry,
+        Verdict::BadOdometry,
+        Verdict::NoUsableBeams,
+        Verdict::Duplicate,
+        Verdict::Late,
+    ];
+    troubled(now, &UNUSABLE, MOSTLY).map(|detail| (State::Degraded, detail))
+}
+
+fn overload(now: &Circumstances<'_>) -> Option<(State, String)> {
+    troubled(now, &[Verdict::Overload], BEARABLE_OVERLOAD).map(|detail| (State::Degraded, detail))
+}
+
+/// What is wrong with more than a share of the last scans; the most frequent trouble is told.
+fn troubled(now: &Circumstances<'_>, troubles: &[Verdict], share: f64) -> Option<String> {
+    let looked_at = |verdict: &&Verdict| !matches!(verdict, Verdict::Paused | Verdict::Throttled);
+    let recent: Vec<&Verdict> = now.gauges.recent.iter().filter(looked_at).collect();
+    let count = |verdict: &Verdict| recent.iter().filter(|other| **other == verdict).count();
+    let troubled: usize = troubles.iter().map(count).sum();
+    if troubled == 0 || (troubled as f64) < share * recent.len() as f64 {
+        return None;
+    }
+    let worst = troubles.iter().max_by_key(|verdict| count(verdict))?;
+    let detail = &now.snapshot.ledger.last().get(worst)?.detail;
+    let (of, all) = (count(worst), recent.len());
+    Some(format!("{of} of the last {all} scans could not be used; of the last of them: {detail}"))
+}
+
+fn no_match(now: &Circumstances<'_>) -> Option<(State, String)> {
+    let shares: Vec<f64> = now.gauges.matched.iter().rev().take(MATCHES).copied().collect();
+    let mean = shares.iter().sum::<f64>() / shares.len().max(1) as f64;
+    if shares.len() < MATCHES || mean >= MOSTLY {
+        return None;
+    }
+    let detail = format!(
+        "the last {MATCHES} scans matched the maps of {:.0} % of the particles, and the others \
+         went by odometry; is minimumScore too high, or the laser mounted otherwise?",
+        mean * 100.0
+    );
+    Some((State::Degraded, detail))
+}
+
+fn mapping(now: &Circumstances<'_>) -> (State, String) {
+    let processed = now.snapshot.ledger.count(Verdict::Processed);
+    let detail = match now.gauges.recent.back() {
+        Some(Verdict::NotMovedEnough) => format!(
+            "{processed} scans are mapped; the robot has not moved by linearUpdate or \
+             angularUpdate since the last"
+        ),
+        _ => format!("{processed} scans are mapped"),
+    };
+    (State::Mapping, detail)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::super::ledger::Ledger;
+    use super::super::mapper::first_snapshot;
+    use super::*;
+
+    /// What is judged of a daemon that runs for five seconds and heard a scan so long ago.
+    fn judged(
+        age_s: Option<f64>,
+        verdicts: &[(Verdict, usize)],
+        change: impl Fn(&mut Gauges),
+    ) -> (State, String) {
+        let key = "robot01/scan".to_owned();
+        let scan = InputStatus { key, received: 7, age_s, ..InputStatus::default() };
+        let mut snapshot = first_snapshot();
+        let mut gauges = Gauges::default();
+        let mut ledger = Ledger::default();
+        for &(verdict, count) in verdicts {
+            for _ in 0..count {
+                ledger.enter(None, verdict, format!("{verdict:?} it is"));
+                gauges.recent.push_back(verdict);
+            }
+        }
+        snapshot.ledger = ledger;
+        change(&mut gauges);
+        let inputs = BTreeMap::from([("scan", scan)]);
+        let snapshot = Arc::new(snapshot);
+        judge(&Circumstances {
+            uptime_s: 5.0,
+            inputs: &inputs,
+            snapshot: &snapshot,
+            gauges: &gauges,
+        })
+    }
+
+    #[test]
+    fn without_scans_the_key_and_the_time_are_told() {
+        let (state, detail) = judged(None, &[], |_| ());
+        assert_eq!(state, State::WaitingForScans);
+        assert!(detail.starts_with("no scan has come on robot01/scan in 5.0 s"), "{detail}");
+        let (state, detail) = judged(Some(4.0), &[(Verdict::Processed, 9)], |_| ());
+        assert_eq!(state, State::WaitingForScans);
+        assert!(detail.contains("for 4.0 s, after 7 before"), "{detail}");
+    }
+
+    #[test]
+    fn without_odometry_the_last_detail_is_told() {
+        let verdicts = [(Verdict::Processed, 3), (Verdict::NoOdometry, 4)];
+        let (state, detail) = judged(Some(0.1), &verdicts, |_| ());
+        assert_eq!(state, State::WaitingForOdometry);
+        assert!(
+            detail.starts_with("4 of the last 7 scans") && detail.ends_with("NoOdometry it is")
+        );
+        let (state, _) = judged(Some(0.1), &[], |gauges| gauges.scans_waiting = 1);
+        assert_eq!(state, State::WaitingForOdometry);
+    }
+
+    #[test]
+    fn the_most_frequent_trouble_is_told() {
+        let verdicts = [(Verdict::NoMount, 2), (Verdict::BadGeometry, 5), (Verdict::Processed, 1)];
+        let (state, detail) = judged(Some(0.1), &verdicts, |_| ());
+        assert_eq!(state, State::Degraded);
+        assert!(detail.ends_with("BadGeometry it is"), "{detail}");
+    }
+
+    #[test]
+    fn a_little_overload_is_borne_and_more_is_told() {
+        let state = |overloaded| {
+            let verdicts = [(Verdict::Overload, overloaded), (Verdict::Processed, 40)];
+            judged(Some(0.1), &verdicts, |_| ()).0
+        };
+        assert_eq!((state(2), state(8)), (State::Mapping, State::Degraded));
+    }
+
+    #[test]
+    fn scans_that_do_not_match_are_told() {
+        let state = |share: f64| {
+            let matched = |gauges: &mut Gauges| gauges.matched = [share; MATCHES].into();
+            judged(Some(0.1), &[(Verdict::Processed, 10)], matched).0
+        };
+        assert_eq!((state(0.3), state(0.9)), (State::Degraded, State::Mapping));
+    }
+
+    #[test]
+    fn pauses_and_throttled_scans_are_no_trouble_and_hide_none() {
+        let verdicts = [(Verdict::Paused, 40), (Verdict::Processed, 1)];
+        assert_eq!(judged(Some(0.1), &verdicts, |_| ()).0, State::Mapping);
+        let verdicts = [(Verdict::Throttled, 40), (Verdict::NoOdometry, 5)];
+        assert_eq!(judged(Some(0.1), &verdicts, |_| ()).0, State::WaitingForOdometry);
+    }
+
+    #[test]
+    fn a_robot_that_stands_is_no_trouble() {
+        let verdicts = [(Verdict::Processed, 2), (Verdict::NotMovedEnough, 40)];
+        let (state, detail) = judged(Some(0.1), &verdicts, |_| ());
+        assert_eq!(state, State::Mapping);
+        assert!(detail.starts_with("2 scans are mapped; the robot has not moved"), "{detail}");
+    }
+}

@@ -1,0 +1,511 @@
+//! The filter's thread: takes what comes, and leaves snapshots and verdicts.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::{broadcast, watch};
+
+use super::command::{Command, Done, Request};
+use super::frames::{FrameNames, Frames};
+use super::input::{Inbox, Input, input_of};
+use super::keys::InputKeys;
+use super::ledger::{Entry, Ledger, Verdict};
+use super::mailbox::{Event, Mail, Mailbox};
+use super::snapshot::{Estimate, MapVersion, Snapshot};
+use super::synchronizer::{self, Call, Channel, ReadyScan, Refusal, ScanCounts, Synchronizer};
+use crate::clock::{self, Stopwatch};
+use crate::config::Config;
+use crate::slam::gmapping::{
+    GMapping, JumpGuard, OdometryUpdate, ScanReading, ScanReport, ScanUpdate, ThreadsError,
+};
+use crate::slam::pose::{Pose2, Stamp};
+use crate::statistics::Spread;
+use crate::tf::{Kind, TfCounts, Transform};
+use crate::timeline::TimelineCounts;
+
+/// Processed scans whose times are kept.
+const TIMED_SCANS: usize = 1000;
+
+/// Verdicts and matches that tell how it goes at the moment.
+const RECENT: usize = 50;
+
+/// What the filter's thread works with.
+#[derive(Debug)]
+pub struct Connections {
+    /// What comes.
+    pub mailbox: Arc<Mailbox>,
+    /// Where what cannot be used is counted.
+    pub inbox: Arc<Inbox>,
+    /// What the filter knows.
+    pub snapshots: watch::Sender<Arc<Snapshot>>,
+    /// What became of each scan.
+    pub verdicts: broadcast::Sender<Entry>,
+    /// How it goes.
+    pub gauges: Arc<Mutex<Gauges>>,
+}
+
+/// How it goes: what the status tells beside the snapshot.
+#[derive(Debug, Clone, Default)]
+pub struct Gauges {
+    /// Scans that wait for odometry.
+    pub scans_waiting: usize,
+    /// Odometry steps that were too long to be believed.
+    pub odometry_jumps: u64,
+    /// Where odometry comes from.
+    pub channel: Option<Channel>,
+    /// Of the odometry.
+    pub odometry: TimelineCounts,
+    /// Of the transforms.
+    pub transforms: TfCounts,
+    /// Of the scans.
+    pub scans: ScanCounts,
+    /// Verdicts of the last scans, oldest first.
+    pub recent: VecDeque<Verdict>,
+    /// Shares of the particles that matched the last processed scans, oldest first.
+    pub matched: VecDeque<f64>,
+    /// Seconds of driving mapped, by the stamps of processed scans.
+    pub mapped_s: f64,
+    /// Seconds that the filter worked for it.
+    pub worked_s: f64,
+}
+
+/// The filter with everything it needs to be fed.
+#[derive(Debug)]
+pub struct Mapper {
+    connections: Connections,
+    filter: GMapping,
+    /// As configured: where the first scan is, and what a jump is.
+    initial_pose: Option<Pose2>,
+    jump: JumpGuard,
+    occupied_threshold: f64,
+    /// Seconds between two versions of the map while scans wait.
+    map_update_interval: f64,
+    synchronizer: Synchronizer,
+    frames: Frames,
+    view: View,
+    gauges: Gauges,
+}
+
+/// What goes into the next snapshot.
+#[derive(Debug)]
+struct View {
+    ledger: Ledger,
+    paused: bool,
+    resamples: u64,
+    times: VecDeque<f64>,
+    milliseconds_per_scan: Option<Spread>,
+    estimate: Estimate,
+    map: Option<Arc<MapVersion>>,
+    version: u64,
+    /// The last scan in the map, if that is newer than the last version.
+    unpublished: Option<Stamp>,
+    /// The last processed scan.
+    processed: Option<Stamp>,
+    /// Odometry at the filter's last step.
+    odom_from_base: Option<Pose2>,
+    /// Whether anything is different from the last snapshot.
+    changed: bool,
+}
+
+impl View {
+    fn new() -> Self {
+        let estimate = Estimate {
+            stamp: None,
+            pose_in_map: Pose2::IDENTITY,
+            covariance: nalgebra::Matrix3::zeros(),
+            map_from_odom: Pose2::IDENTITY,
+            particles: Arc::new([]),
+            report: None,
+        };
+        Self {
+            ledger: Ledger::default(),
+            paused: false,
+            resamples: 0,
+            times: VecDeque::new(),
+            milliseconds_per_scan: None,
+            estimate,
+            map: None,
+            version: 0,
+            unpublished: None,
+            processed: None,
+            odom_from_base: None,
+            changed: true,
+        }
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            estimate: self.estimate.clone(),
+            ledger: self.ledger.clone(),
+            milliseconds_per_scan: self.milliseconds_per_scan,
+            resamples: self.resamples,
+            paused: self.paused,
+            map: self.map.clone(),
+        }
+    }
+}
+
+/// The snapshot before anything has come.
+#[must_use]
+pub fn first_snapshot() -> Snapshot {
+    View::new().snapshot()
+}
+
+impl Mapper {
+    /// A filter before its first scan.
+    ///
+    /// # Errors
+    /// When the filter's threads cannot be started.
+    pub fn new(
+        connections: Connections,
+        config: &Config,
+        keys: &InputKeys,
+        threads: usize,
+    ) -> Result<Self, ThreadsError> {
+        let parameters = config.parameters();
+        let mut mapper = Self {
+            connections,
+            initial_pose: parameters.initial_pose,
+            jump: parameters.jump,
+            occupied_threshold: parameters.map.occupied_threshold,
+            filter: GMapping::new(parameters, config.raw.seed, threads)?,
+            map_update_interval: config.raw.map_update_interval,
+            synchronizer: synchronizer(config, keys),
+            frames: frames(config, keys),
+            view: View::new(),
+            gauges: Gauges::default(),
+        };
+        mapper.renew_estimate(None);
+        mapper.publish();
+        Ok(mapper)
+    }
+
+    /// Works until the mailbox is closed and empty, or later than it may be.
+    pub fn run(mut self) {
+        while self.step() == Flow::GoOn {
+            self.publish();
+        }
+        self.finish();
+    }
+
+    fn step(&mut self) -> Flow {
+        if let Some(event) = self.connections.mailbox.urgent(clock::now()) {
+            return self.handle(event);
+        }
+        if let Some(call) = self.synchronizer.next_call() {
+            self.make(call);
+            return Flow::GoOn;
+        }
+        let event = self.next_event();
+        self.handle(event)
+    }
+
+    /// What the mailbox holds next; while it is empty, the map is brought up to date.
+    fn next_event(&mut self) -> Event {
+        if let Some(event) = self.connections.mailbox.take(clock::now()) {
+            return event;
+        }
+        if self.view.unpublished.is_some() {
+            self.renew_map();
+            self.publish();
+        }
+        self.connections.mailbox.wait(self.synchronizer.deadline(), clock::now)
+    }
+
+    fn handle(&mut self, event: Event) -> Flow {
+        match event {
+            Event::Command(request) => self.obey(request),
+            Event::Refusal(refusal) => self.refuse(refusal),
+            Event::Mail(mail) => self.feed(mail),
+            Event::Expired => self.synchronizer.expire(clock::now(), &self.frames),
+            Event::Closed => return Flow::End,
+        }
+        Flow::GoOn
+    }
+
+    fn feed(&mut self, mail: Mail) {
+        match mail {
+            Mail::Odometry(stamp, odom_from_base) => {
+                self.take_odometry(Channel::Messages, stamp, odom_from_base);
+            }
+            Mail::Transform(transform, kind) => self.take_transform(&transform, kind),
+            Mail::Scan(framed) => self.synchronizer.scan(framed, clock::now(), &self.frames),
+        }
+    }
+
+    fn take_transform(&mut self, transform: &Transform, kind: Kind) {
+        if let Err(error) = self.frames.insert(transform, kind) {
+            self.connections.inbox.reject(input_of(kind), error.to_string());
+            return;
+        }
+        for (stamp, odom_from_base) in self.frames.new_odometry() {
+            match odom_from_base {
+                Ok(pose) => self.take_odometry(Channel::Transforms, stamp, pose),
+                Err(error) => self.connections.inbox.reject(Input::Tf, error.to_string()),
+            }
+        }
+        self.synchronizer.frames_changed(&self.frames);
+    }
+
+    fn take_odometry(&mut self, channel: Channel, stamp: Stamp, odom_from_base: Pose2) {
+        if self.synchronizer.odometry(channel, (stamp, odom_from_base), &self.frames) {
+            self.follow_odometry();
+        }
+    }
+
+    /// Between scans the pose follows odometry, which the filter gets with the next scan.
+    fn follow_odometry(&mut self) {
+        let estimate = &mut self.view.estimate;
+        let Some((stamp, odom_from_base)) = self.synchronizer.newest_odometry() else { return };
+        let (Some(last), Some(before)) = (estimate.stamp, self.view.odom_from_base) else { return };
+        if stamp > last && !self.jump.rejects(before.between(odom_from_base)) {
+            estimate.stamp = Some(stamp);
+            estimate.pose_in_map = estimate.map_from_odom * odom_from_base;
+            self.view.changed = true;
+        }
+    }
+
+    fn make(&mut self, call: Call) {
+        match call {
+            Call::Odometry(odom_from_base) => self.add_odometry(odom_from_base),
+            Call::Scan(ready) if self.view.paused => {
+                self.add_odometry(ready.odom_from_base);
+                self.enter(Some(ready.scan.stamp), Verdict::Paused, String::new());
+            }
+            Call::Scan(ready) => self.add_scan(&ready),
+            Call::Refuse(refusal) => self.refuse(refusal),
+        }
+    }
+
+    fn add_odometry(&mut self, odom_from_base: Pose2) {
+        match self.filter.add_odometry(odom_from_base) {
+            OdometryUpdate::Accepted => {}
+            OdometryUpdate::JumpRejected => self.gauges.odometry_jumps += 1,
+            OdometryUpdate::NotUsable => return,
+        }
+        self.view.odom_from_base = Some(odom_from_base);
+    }
+
+    fn add_scan(&mut self, ready: &ReadyScan) {
+        let ReadyScan { scan, mount, odom_from_base } = ready;
+        // Interpolated odometry passes the jump guard too; the scan's own counts no second time.
+        self.add_odometry(*odom_from_base);
+        let reading = ScanReading { scan, mount, odom_from_base: *odom_from_base };
+        let watch = Stopwatch::start();
+        match self.filter.add_scan(&reading, &mut |_| ()) {
+            ScanUpdate::Processed(report) => {
+                self.count_time(watch.elapsed().wall, scan.stamp);
+                self.processed(scan.stamp, report);
+                self.enter(Some(scan.stamp), Verdict::Processed, String::new());
+            }
+            ScanUpdate::Skipped(reason) => {
+                let verdict = Verdict::from(reason);
+                self.renew_estimate(Some(scan.stamp));
+                self.enter(Some(scan.stamp), verdict, detail(verdict, ready));
+            }
+        }
+    }
+
+    fn count_time(&mut self, spent: Duration, stamp: Stamp) {
+        push_bounded(&mut self.view.times, spent.as_secs_f64() * 1e3, TIMED_SCANS);
+        self.view.milliseconds_per_scan = Spread::of(self.view.times.make_contiguous());
+        let driven = self.view.processed.map_or(0.0, |before| stamp.seconds_since(before));
+        if driven > 0.0 {
+            self.gauges.mapped_s += driven;
+            self.gauges.worked_s += spent.as_secs_f64();
+        }
+        self.view.processed = Some(stamp);
+    }
+
+    fn processed(&mut self, stamp: Stamp, report: ScanReport) {
+        self.view.resamples += u64::from(report.resampled);
+        let particles = self.filter.particles();
+        let share = report.matched as f64 / particles.len().max(1) as f64;
+        push_bounded(&mut self.gauges.matched, share, RECENT);
+        self.view.estimate.particles = particles.iter().map(|p| p.pose_in_map()).collect();
+        self.view.estimate.covariance = self.filter.cloud_covariance();
+        self.view.estimate.report = Some(report);
+        self.renew_estimate(Some(stamp));
+        self.view.unpublished = Some(stamp);
+        let last = self.view.map.as_ref().map(|map| stamp.seconds_since(map.stamp));
+        // A clock that was set back does not stop the map.
+        if last.is_none_or(|passed| passed >= self.map_update_interval || passed < 0.0) {
+            self.renew_map();
+        }
+    }
+
+    /// The pose as the filter has it, and odometry that it has not got yet.
+    fn renew_estimate(&mut self, stamp: Option<Stamp>) {
+        let estimate = &mut self.view.estimate;
+        estimate.pose_in_map = self.filter.pose_in_map();
+        estimate.map_from_odom = self.filter.map_from_odom();
+        estimate.stamp = if self.filter.particles().is_empty() { None } else { stamp };
+        self.view.changed = true;
+        self.follow_odometry();
+    }
+
+    fn renew_map(&mut self) {
+        let Some(stamp) = self.view.unpublished.take() else { return };
+        self.view.version += 1;
+        self.view.changed = true;
+        self.view.map = Some(Arc::new(MapVersion {
+            version: self.view.version,
+            stamp,
+            occupancy: self.filter.occupancy().clone(),
+            occupied_threshold: self.occupied_threshold,
+            path: self.filter.path(),
+        }));
+    }
+
+    fn refuse(&mut self, refusal: Refusal) {
+        self.enter(refusal.stamp, refusal.verdict, refusal.detail);
+    }
+
+    fn enter(&mut self, stamp: Option<Stamp>, verdict: Verdict, detail: String) {
+        self.view.changed = true;
+        let entry = self.view.ledger.enter(stamp, verdict, detail);
+        tracing::trace!(number = entry.number, ?verdict, detail = entry.detail, "scan");
+        // Nobody may be listening.
+        self.connections.verdicts.send(entry.clone()).ok();
+        push_bounded(&mut self.gauges.recent, verdict, RECENT);
+    }
+
+    fn obey(&mut self, request: Request) {
+        let (done, changed) = match request.command {
+            Command::Pause => self.pause(),
+            Command::Resume => self.resume(),
+            Command::Reset(pose_in_map) => self.reset(pose_in_map),
+            Command::InitialPose(pose_in_map) => self.set_pose(pose_in_map),
+        };
+        tracing::info!(command = ?request.command, done, "command");
+        self.view.changed = true;
+        self.publish();
+        // Whoever asked may be gone.
+        request.reply.send(Done { done, changed }).ok();
+    }
+
+    fn pause(&mut self) -> (String, bool) {
+        self.renew_map();
+        let changed = !std::mem::replace(&mut self.view.paused, true);
+        let done = if changed { "mapping is paused" } else { "mapping was paused already" };
+        (format!("{done}; slam/cmd/resume goes on"), changed)
+    }
+
+    fn resume(&mut self) -> (String, bool) {
+        let changed = std::mem::replace(&mut self.view.paused, false);
+        let done = if changed { "mapping goes on" } else { "mapping was not paused" };
+        (done.to_owned(), changed)
+    }
+
+    fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
+        self.filter.reset(pose_in_map.or(self.initial_pose));
+        let before = std::mem::replace(&mut self.view, View::new());
+        self.view.ledger = before.ledger;
+        self.view.paused = before.paused;
+        self.view.version = before.version;
+        self.gauges.matched.clear();
+        self.renew_estimate(None);
+        let at = match pose_in_map.or(self.initial_pose) {
+            Some(pose) => format!("at {}", in_words(pose)),
+            None => "where odometry says".to_owned(),
+        };
+        (format!("map and path are forgotten; the next scan begins a new map {at}"), true)
+    }
+
+    fn set_pose(&mut self, pose_in_map: Pose2) -> (String, bool) {
+        let mapping = !self.filter.particles().is_empty();
+        self.filter.set_pose(pose_in_map);
+        let stamp = self.view.estimate.stamp;
+        self.view.estimate.particles =
+            self.filter.particles().iter().map(|p| p.pose_in_map()).collect();
+        self.renew_estimate(stamp);
+        let place = in_words(pose_in_map);
+        if mapping {
+            (format!("all particles are moved, so that the robot is at {place}"), true)
+        } else {
+            (format!("the map will begin with the robot at {place}"), true)
+        }
+    }
+
+    fn finish(mut self) {
+        self.synchronizer.finish(&self.frames);
+        while let Some(call) = self.synchronizer.next_call() {
+            if self.connections.mailbox.is_over(clock::now()) {
+                break;
+            }
+            self.make(call);
+        }
+        self.renew_map();
+        self.publish();
+    }
+
+    fn publish(&mut self) {
+        let gauges = &mut self.gauges;
+        gauges.scans_waiting = self.synchronizer.waiting();
+        gauges.channel = self.synchronizer.channel();
+        gauges.odometry = self.synchronizer.odometry_counts();
+        gauges.scans = self.synchronizer.scan_counts();
+        gauges.transforms = self.frames.counts();
+        let shared = &self.connections.gauges;
+        shared.lock().unwrap_or_else(PoisonError::into_inner).clone_from(gauges);
+        if std::mem::take(&mut self.view.changed) {
+            self.connections.snapshots.send_replace(Arc::new(self.view.snapshot()));
+        }
+    }
+}
+
+fn synchronizer(config: &Config, keys: &InputKeys) -> Synchronizer {
+    let raw = &config.raw;
+    Synchronizer::new(synchronizer::Settings {
+        odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
+        most_waiting: raw.scan_queue,
+        source: raw.odometry_source,
+        odom_key: keys.of(Input::Odom).to_string(),
+        tf_path: format!(
+            "{} (from `{}` to `{}`)",
+            keys.of(Input::Tf),
+            raw.odom_frame,
+            raw.base_frame
+        ),
+    })
+}
+
+fn frames(config: &Config, keys: &InputKeys) -> Frames {
+    let raw = &config.raw;
+    let names = FrameNames { base: raw.base_frame.clone(), odom: raw.odom_frame.clone() };
+    Frames::new(names, config.laser_mount(), keys.of(Input::TfStatic).to_string())
+}
+
+/// Whether the thread goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Flow {
+    GoOn,
+    End,
+}
+
+/// What there is to say about a scan that the filter skipped.
+fn detail(verdict: Verdict, ready: &ReadyScan) -> String {
+    match verdict {
+        Verdict::NoUsableBeams => format!(
+            "none of its {} beams ends within range_max and maxUrange",
+            ready.scan.ranges.len()
+        ),
+        Verdict::BadOdometry => {
+            let Pose2 { x, y, theta } = ready.odom_from_base;
+            format!("odometry has the base at x {x} m, y {y} m, yaw {theta} rad")
+        }
+        _ => String::new(),
+    }
+}
+
+fn in_words(pose: Pose2) -> String {
+    format!("x {:.3} m, y {:.3} m, yaw {:.4} rad", pose.x, pose.y, pose.theta)
+}
+
+fn push_bounded<T>(values: &mut VecDeque<T>, value: T, most: usize) {
+    if values.len() >= most {
+        values.pop_front();
+    }
+    values.push_back(value);
+}

@@ -1,0 +1,438 @@
+//! Puts odometry and scans in the order in which the filter takes them.
+//!
+//! A scan waits until odometry at or after its stamp is known. Then the filter gets all odometry up
+//! to the scan, and the scan with odometry's pose at its stamp: what it gets does not depend on
+//! what came first, as long as nothing is late. No clock is read here.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use super::frames::{Frames, MountError};
+use super::ledger::Verdict;
+use crate::config::OdometrySource;
+use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::scan::{LaserMount, Scan};
+use crate::timeline::{Missing, OdometryBuffer, TimelineCounts};
+
+/// How much odometry is kept, and at most how many samples: ten seconds at a kilohertz.
+const KEEP: Duration = Duration::from_secs(10);
+const MOST_SAMPLES: usize = 10_000;
+
+/// Odometry this much older than the newest goes to the filter though no scan asks for it, ns.
+///
+/// Scans older than that are late.
+const HORIZON: i64 = 5_000_000_000;
+
+/// A scan this much before the last that was taken may come from a clock that was set back, ns.
+const CLOCK_SET_BACK: i64 = 500_000_000;
+
+/// A second scan after such a one belongs to it if it is not later than this, ns.
+const CLOCK_RESTARTED: i64 = 10_000_000_000;
+
+/// Odometry that is missing by more than this, s, is hardly only late.
+const CLOCKS_DIFFER_S: f64 = 1.0;
+
+/// How to wait, and what to say while waiting.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// How long a scan waits, and how much later than it its odometry may be stamped.
+    pub odometry_timeout: Duration,
+    /// Scans that may wait.
+    pub most_waiting: usize,
+    /// Where odometry comes from.
+    pub source: OdometrySource,
+    /// The key of odometry messages.
+    pub odom_key: String,
+    /// Which transforms tell odometry, in words: key and frames.
+    pub tf_path: String,
+}
+
+/// Odometry's messages or its transforms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Channel {
+    /// `nav_msgs/Odometry`.
+    Messages,
+    /// From `odom_frame` to `base_frame`.
+    Transforms,
+}
+
+/// A scan and the frame of its laser.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FramedScan {
+    /// The sweep.
+    pub scan: Scan,
+    /// The frame it was taken in.
+    pub frame: String,
+}
+
+/// What is to be done next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Call {
+    /// The filter takes odometry.
+    Odometry(Pose2),
+    /// The filter takes a scan.
+    Scan(ReadyScan),
+    /// A scan does not reach the filter.
+    Refuse(Refusal),
+}
+
+/// A scan with all that is needed to use it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReadyScan {
+    /// The sweep.
+    pub scan: Scan,
+    /// How the laser sits.
+    pub mount: LaserMount,
+    /// The base at the scan's stamp.
+    pub odom_from_base: Pose2,
+}
+
+/// A scan that does not reach the filter.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refusal {
+    /// The scan's; `None` if its bytes could not be read.
+    pub stamp: Option<Stamp>,
+    /// Why, in a word.
+    pub verdict: Verdict,
+    /// Why, in a sentence; may be empty.
+    pub detail: String,
+}
+
+/// What became of scans that were not simply the newest.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ScanCounts {
+    /// With the stamp of an earlier one.
+    pub duplicates: u64,
+    /// After a newer one.
+    pub reordered: u64,
+    /// Times the clock was set back.
+    pub clock_restarts: u64,
+}
+
+/// A scan that waits.
+#[derive(Debug)]
+struct Waiting {
+    framed: FramedScan,
+    since: Instant,
+}
+
+impl Waiting {
+    const fn stamp(&self) -> Stamp {
+        self.framed.scan.stamp
+    }
+}
+
+/// Why a scan is not ready.
+#[derive(Debug)]
+struct Lack {
+    verdict: Verdict,
+    detail: String,
+    /// Whether what it lacks cannot come any more.
+    hopeless: bool,
+}
+
+/// Scans and odometry on their way to the filter.
+#[derive(Debug)]
+pub struct Synchronizer {
+    settings: Settings,
+    odometry: OdometryBuffer,
+    /// Where the odometry comes from that is kept.
+    channel: Option<Channel>,
+    /// The last odometry the filter got; of it, nothing older is of use.
+    fed: Option<Stamp>,
+    /// In the order of their stamps.
+    waiting: VecDeque<Waiting>,
+    /// The last scan the filter got.
+    taken: Option<Stamp>,
+    /// The last scan, if it came much too late: one more such, and the clock was set back.
+    suspect: Option<Stamp>,
+    calls: VecDeque<Call>,
+    counts: ScanCounts,
+}
+
+impl Synchronizer {
+    /// Nothing has come yet.
+    #[must_use]
+    pub fn new(settings: Settings) -> Self {
+        Self {
+            settings,
+            odometry: OdometryBuffer::new(KEEP, MOST_SAMPLES),
+            channel: None,
+            fed: None,
+            waiting: VecDeque::new(),
+            taken: None,
+            suspect: None,
+            calls: VecDeque::new(),
+            counts: ScanCounts::default(),
+        }
+    }
+
+    /// Takes odometry; `false` if it comes on a channel that is not listened to.
+    pub fn odometry(
+        &mut self,
+        channel: Channel,
+        (stamp, odom_from_base): (Stamp, Pose2),
+        frames: &Frames,
+    ) -> bool {
+        if !self.listens_to(channel) {
+            return false;
+        }
+        // What is about to be forgotten, for this sample comes long after it.
+        self.feed(Stamp(stamp.0.saturating_sub(HORIZON)));
+        let restarts = self.odometry.counts().restarts;
+        self.odometry.insert(stamp, odom_from_base);
+        if self.odometry.counts().restarts > restarts {
+            self.fed = None;
+        }
+        self.release(frames);
+        if let Some(newest) = self.odometry.newest() {
+            self.feed(Stamp(newest.0.saturating_sub(HORIZON)));
+        }
+        true
+    }
+
+    /// Whether odometry of a channel is used; messages take the place of transforms until the
+    /// filter has got odometry.
+    fn listens_to(&mut self, channel: Channel) -> bool {
+        let wanted = match self.settings.source {
+            OdometrySource::Odom => channel == Channel::Messages,
+            OdometrySource::Tf => channel == Channel::Transforms,
+            OdometrySource::Auto => match self.channel {
+                None => true,
+                Some(Channel::Transforms) if channel == Channel::Messages && self.fed.is_none() => {
+                    self.odometry = OdometryBuffer::new(KEEP, MOST_SAMPLES);
+                    true
+                }
+                Some(current) => current == channel,
+            },
+        };
+        if wanted {
+            self.channel = Some(channel);
+        }
+        wanted
+    }
+
+    /// Takes a scan at the time `now`.
+    pub fn scan(&mut self, framed: FramedScan, now: Instant, frames: &Frames) {
+        let stamp = framed.scan.stamp;
+        if let Some((verdict, detail)) = self.out_of_order(stamp) {
+            self.refuse(stamp, verdict, detail);
+            return;
+        }
+        let position = self.waiting.partition_point(|other| other.stamp() < stamp);
+        if self.waiting.get(position).is_some_and(|other| other.stamp() == stamp) {
+            self.counts.duplicates += 1;
+            self.refuse(stamp, Verdict::Duplicate, "a scan with this stamp waits already".into());
+            return;
+        }
+        self.counts.reordered += u64::from(position < self.waiting.len());
+        self.waiting.insert(position, Waiting { framed, since: now });
+        self.release(frames);
+        self.make_room();
+    }
+
+    /// What a scan is that does not come after the last that was taken.
+    fn out_of_order(&mut self, stamp: Stamp) -> Option<(Verdict, String)> {
+        let suspect = self.suspect.take();
+        let taken = self.taken.filter(|taken| stamp <= *taken)?;
+        if stamp == taken {
+            self.counts.duplicates += 1;
+            return Some((Verdict::Duplicate, "the last scan had this stamp".to_owned()));
+        }
+        let before = taken.0.saturating_sub(stamp.0);
+        if before > CLOCK_SET_BACK {
+            let follows =
+                |first: Stamp| stamp > first && stamp.0.saturating_sub(first.0) <= CLOCK_RESTARTED;
+            if suspect.is_some_and(follows) {
+                self.counts.clock_restarts += 1;
+                self.taken = None;
+                return None;
+            }
+            self.suspect = Some(stamp);
+        }
+        self.counts.reordered += 1;
+        let by = before as f64 / 1e6;
+        Some((Verdict::Late, format!("a scan that is {by:.1} ms newer was taken before it")))
+    }
+
+    fn make_room(&mut self) {
+        while self.waiting.len() > self.settings.most_waiting {
+            if let Some(oldest) = self.waiting.pop_front() {
+                let detail = format!(
+                    "{} newer scans came while it waited for its odometry",
+                    self.settings.most_waiting
+                );
+                self.refuse(oldest.stamp(), Verdict::Overload, detail);
+            }
+        }
+    }
+
+    /// Looks again at the scans that wait, for a transform came.
+    pub fn frames_changed(&mut self, frames: &Frames) {
+        self.release(frames);
+    }
+
+    /// Ends the waiting of scans that have waited long enough at the time `now`.
+    pub fn expire(&mut self, now: Instant, frames: &Frames) {
+        let timeout = self.settings.odometry_timeout;
+        self.give_up(frames, |waiting| waiting.since + timeout <= now);
+    }
+
+    /// Ends the waiting of all scans: nothing will come any more.
+    pub fn finish(&mut self, frames: &Frames) {
+        self.give_up(frames, |_| true);
+    }
+
+    fn give_up(&mut self, frames: &Frames, which: impl Fn(&Waiting) -> bool) {
+        for waiting in std::mem::take(&mut self.waiting) {
+            match self.place(&waiting.framed, frames) {
+                Err(lack) if which(&waiting) => {
+                    self.refuse(waiting.stamp(), lack.verdict, lack.detail);
+                }
+                _ => self.waiting.push_back(waiting),
+            }
+        }
+        self.release(frames);
+    }
+
+    /// When [`Self::expire`] is to be called; `None` while no scan waits.
+    #[must_use]
+    pub fn deadline(&self) -> Option<Instant> {
+        let since = self.waiting.iter().map(|waiting| waiting.since).min()?;
+        Some(since + self.settings.odometry_timeout)
+    }
+
+    /// What is to be done next.
+    pub fn next_call(&mut self) -> Option<Call> {
+        self.calls.pop_front()
+    }
+
+    /// The newest odometry, which the filter may not have got yet.
+    #[must_use]
+    pub fn newest_odometry(&self) -> Option<(Stamp, Pose2)> {
+        let newest = self.odometry.newest()?;
+        Some((newest, self.odometry.at(newest).ok()?))
+    }
+
+    /// How many scans wait.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        let ready = self.calls.iter().filter(|call| matches!(call, Call::Scan(_))).count();
+        self.waiting.len() + ready
+    }
+
+    /// Where odometry comes from; `None` before the first.
+    #[must_use]
+    pub const fn channel(&self) -> Option<Channel> {
+        self.channel
+    }
+
+    /// What became of odometry that was not simply the newest.
+    #[must_use]
+    pub const fn odometry_counts(&self) -> TimelineCounts {
+        self.odometry.counts()
+    }
+
+    /// What became of scans that were not simply the newest.
+    #[must_use]
+    pub const fn scan_counts(&self) -> ScanCounts {
+        self.counts
+    }
+
+    /// Calls what is ready. Scans stay in the order of their stamps: one that waits holds up those
+    /// after it.
+    fn release(&mut self, frames: &Frames) {
+        while let Some(first) = self.waiting.pop_front() {
+            match self.place(&first.framed, frames) {
+                Ok((mount, odom_from_base)) => {
+                    let scan = first.framed.scan;
+                    self.feed(scan.stamp);
+                    self.taken = Some(scan.stamp);
+                    self.calls.push_back(Call::Scan(ReadyScan { scan, mount, odom_from_base }));
+                }
+                Err(lack) if lack.hopeless => {
+                    self.refuse(first.stamp(), lack.verdict, lack.detail);
+                }
+                Err(_) => {
+                    self.waiting.push_front(first);
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Gives the filter the odometry up to a stamp.
+    fn feed(&mut self, until: Stamp) {
+        for &(stamp, odom_from_base) in self.odometry.between(self.fed, until) {
+            self.fed = Some(stamp);
+            self.calls.push_back(Call::Odometry(odom_from_base));
+        }
+    }
+
+    fn refuse(&mut self, stamp: Stamp, verdict: Verdict, detail: String) {
+        self.calls.push_back(Call::Refuse(Refusal { stamp: Some(stamp), verdict, detail }));
+    }
+
+    /// How the laser sat and where odometry had the base when a scan was taken.
+    fn place(&self, framed: &FramedScan, frames: &Frames) -> Result<(LaserMount, Pose2), Lack> {
+        let stamp = framed.scan.stamp;
+        let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
+            let (verdict, hopeless) = match error {
+                MountError::Tilted { .. } => (Verdict::TiltedMount, true),
+                MountError::NoFrame { .. } => (Verdict::NoMount, true),
+                MountError::Unknown { .. } => (Verdict::NoMount, false),
+            };
+            Lack { verdict, detail: error.to_string(), hopeless }
+        })?;
+        Ok((mount, self.odometry_at(stamp)?))
+    }
+
+    fn odometry_at(&self, stamp: Stamp) -> Result<Pose2, Lack> {
+        let too_late = |other: Stamp| {
+            let after = other.seconds_since(stamp);
+            after > self.settings.odometry_timeout.as_secs_f64()
+        };
+        let next = self.odometry.next(stamp);
+        match (self.odometry.at(stamp), next.filter(|next| too_late(*next))) {
+            (Ok(odom_from_base), None) => Ok(odom_from_base),
+            (Ok(_), Some(next)) => {
+                Err(self.lack(next.seconds_since(stamp), "the next is newer than the scan", true))
+            }
+            (Err(Missing::TooOld(by)), _) => {
+                let hopeless = self.odometry.newest().is_some_and(too_late);
+                Err(self.lack(by.as_secs_f64(), "the oldest is newer than the scan", hopeless))
+            }
+            (Err(Missing::TooNew(by)), _) => {
+                Err(self.lack(by.as_secs_f64(), "the newest is older than the scan", false))
+            }
+            (Err(Missing::Empty), _) => {
+                let detail = format!("no odometry has come {}", self.origin());
+                Err(Lack { verdict: Verdict::NoOdometry, detail, hopeless: false })
+            }
+        }
+    }
+
+    fn lack(&self, missing_s: f64, what: &str, hopeless: bool) -> Lack {
+        let remedy = if missing_s > CLOCKS_DIFFER_S {
+            "do the clocks that stamp them agree, and does odometry still come?"
+        } else {
+            "if odometry only comes late or seldom, raise odometry_timeout_s"
+        };
+        let origin = self.origin();
+        let milliseconds = missing_s * 1e3;
+        let detail = format!(
+            "odometry is missing by {milliseconds:.1} ms: {what} by that, of those {origin}; {remedy}"
+        );
+        Lack { verdict: Verdict::NoOdometry, detail, hopeless }
+    }
+
+    /// Where odometry comes from or is expected, in words.
+    fn origin(&self) -> String {
+        let Settings { source, odom_key, tf_path, .. } = &self.settings;
+        match (source, self.channel) {
+            (OdometrySource::Odom, _) | (_, Some(Channel::Messages)) => format!("on {odom_key}"),
+            (OdometrySource::Tf, _) | (_, Some(Channel::Transforms)) => format!("in {tf_path}"),
+            (OdometrySource::Auto, None) => format!("on {odom_key} or in {tf_path}"),
+        }
+    }
+}
