@@ -3,8 +3,12 @@
 //! What comes is handed on by Zenoh's callbacks ([`input`]), decoded by a task, and put in the
 //! [`mailbox`] of the filter's thread ([`mapper`]), which puts it in order ([`synchronizer`]),
 //! runs the filter, and leaves a [`snapshot`] and an entry in the [`ledger`] for each scan.
+//! From these [`serving`] publishes and answers.
 
+mod answers;
 pub mod command;
+mod diagnostics;
+pub mod formats;
 pub mod frames;
 pub mod input;
 mod judgement;
@@ -12,11 +16,18 @@ pub mod keys;
 pub mod ledger;
 pub mod mailbox;
 pub mod mapper;
+mod message_clock;
+mod outputs;
+mod queries;
+pub mod save;
+pub mod selector;
+pub mod serving;
 pub mod snapshot;
 pub mod status;
 pub mod synchronizer;
 
 use std::future::Future;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -28,11 +39,14 @@ use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
 use self::command::Request;
+use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
 use self::keys::{InputKeys, KeyError, Prefix};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
+use self::save::{NameError, SaveName, Saver};
+use self::serving::{Serving, ServingError, Sources};
 use self::snapshot::{Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
@@ -74,6 +88,12 @@ pub enum DaemonError {
     /// A key cannot be used.
     #[error(transparent)]
     Key(#[from] KeyError),
+    /// `save_on_exit` is not a name.
+    #[error("save_on_exit: {0}")]
+    SaveName(#[from] NameError),
+    /// Nothing can be published or answered.
+    #[error(transparent)]
+    Serving(#[from] ServingError),
     /// The filter's threads do not start.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
@@ -127,7 +147,18 @@ pub struct Daemon {
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
     status: Arc<StatusSource>,
+    /// `None` once stopped.
+    serving: Option<Serving>,
+    saving: Saving,
     helpers: [JoinHandle<()>; 2],
+}
+
+/// What is saved at the end.
+#[derive(Debug)]
+struct Saving {
+    name: Option<SaveName>,
+    directory: PathBuf,
+    empty: EmptyMap,
 }
 
 #[derive(Debug)]
@@ -143,6 +174,7 @@ impl Daemon {
     /// When a key cannot be used, or a thread does not start.
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
+        let exit_name = config.raw.save_on_exit.as_deref().map(SaveName::parse).transpose()?;
         let keys = InputKeys::new(&prefix, &config.raw.keys)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
@@ -170,8 +202,15 @@ impl Daemon {
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),
             tokio::spawn(log_changes(Arc::clone(&status))),
         ];
-        // Here serving::start(...) begins: publishers and queryables, which take `snapshots`,
-        // `verdicts`, `commands` and `status`, before anything comes in.
+        let sources = Sources {
+            snapshots: snapshots.clone(),
+            verdicts: verdicts.subscribe(),
+            commands: commands.clone(),
+            status: asked(&status),
+        };
+        let saving = Saving::new(&config, exit_name);
+        let served = serving::Settings::new(&config, saving.directory());
+        let serving = Serving::start(session, &prefix, served, sources).await?;
         let subscribers = subscribe(session, &keys, &inbox).await?;
         tell_keys(&keys);
         Ok(Self {
@@ -184,6 +223,8 @@ impl Daemon {
             verdicts,
             commands,
             status,
+            serving: Some(serving),
+            saving,
             helpers,
         })
     }
@@ -231,8 +272,12 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
-        // Here the map is saved, if save_on_exit says so, and serving stops.
-        self.snapshots.borrow().clone()
+        if let Some(serving) = self.serving.take() {
+            tokio::time::timeout(CLOSE, serving.stop()).await.ok();
+        }
+        let last = self.snapshots.borrow().clone();
+        self.saving.save(&last);
+        last
     }
 }
 
@@ -242,6 +287,29 @@ impl Drop for Daemon {
         self.inbox.close();
         self.mailbox.close(clock::now());
         self.helpers.iter().for_each(JoinHandle::abort);
+    }
+}
+
+impl Saving {
+    fn new(config: &Config, name: Option<SaveName>) -> Self {
+        let directory = PathBuf::from(&config.raw.save_directory);
+        let raw = &config.raw;
+        let empty = EmptyMap { frame: raw.map_frame.clone(), resolution: raw.resolution };
+        Self { name, directory, empty }
+    }
+
+    fn directory(&self) -> PathBuf {
+        self.directory.clone()
+    }
+
+    /// Saves the last map, if the configuration asks for it and there is one.
+    fn save(&self, last: &Snapshot) {
+        let Some(name) = &self.name else { return };
+        let products = MapProducts::new(last.map.clone(), self.empty.clone());
+        match Saver::new(self.directory.clone()).save(name, &products) {
+            Ok(saved) => tracing::info!("{}", saved.done),
+            Err(error) => tracing::error!("the last map is not saved: {error}"),
+        }
     }
 }
 
@@ -296,6 +364,12 @@ async fn subscribe(
         .await
         .map_err(failed(Input::TfStatic))?;
     Ok(Subscribers { changing, constant })
+}
+
+/// The status as those ask for it that serve it.
+fn asked(status: &Arc<StatusSource>) -> serving::StatusSource {
+    let status = Arc::clone(status);
+    serving::StatusSource::new(move || status.status())
 }
 
 fn tell_keys(keys: &InputKeys) {
