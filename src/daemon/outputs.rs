@@ -26,7 +26,7 @@ use super::keys::Prefix;
 use super::ledger::Entry;
 use super::message_clock::MessageClock;
 use super::selector::{MessageFormat, PathFormat};
-use super::serving::{ServingError, Settings, StatusSource};
+use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
 use crate::clock::Stopwatch;
 use crate::convert;
@@ -102,7 +102,7 @@ impl Declare<'_> {
     /// `diagnostics`.
     pub(super) async fn diagnostics(
         &self,
-        status: StatusSource,
+        status: AskStatus,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
         let publisher = self.plain("diagnostics", cdr_of::<ros::DiagnosticArray>()).await?;
@@ -359,7 +359,7 @@ async fn publish_transform(
     }
 }
 
-async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: StatusSource) {
+async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: AskStatus) {
     let mut ticks = tokio::time::interval(DIAGNOSTICS_PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {

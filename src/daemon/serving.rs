@@ -68,9 +68,9 @@ fn duration(seconds: f64) -> Duration {
 
 /// Asks how the daemon is.
 #[derive(Clone)]
-pub struct StatusSource(Arc<dyn Fn() -> Status + Send + Sync>);
+pub struct AskStatus(Arc<dyn Fn() -> Status + Send + Sync>);
 
-impl StatusSource {
+impl AskStatus {
     /// Asks this function, on any thread.
     #[must_use]
     pub fn new(status: impl Fn() -> Status + Send + Sync + 'static) -> Self {
@@ -84,9 +84,9 @@ impl StatusSource {
     }
 }
 
-impl fmt::Debug for StatusSource {
+impl fmt::Debug for AskStatus {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.debug_struct("StatusSource").finish_non_exhaustive()
+        formatter.debug_struct("AskStatus").finish_non_exhaustive()
     }
 }
 
@@ -100,7 +100,7 @@ pub struct Sources {
     /// Takes commands to the filter.
     pub commands: mpsc::Sender<Request>,
     /// Tells how the daemon is.
-    pub status: StatusSource,
+    pub status: AskStatus,
 }
 
 /// Why nothing can be served.
