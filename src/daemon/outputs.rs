@@ -289,15 +289,15 @@ struct EstimateOutputs {
 
 impl EstimateOutputs {
     async fn run(self, mut snapshots: Snapshots) {
-        let mut stamp = None;
+        let mut last = None;
         let mut particles: Arc<[Pose2]> = Arc::new([]);
         snapshots.mark_changed();
         while snapshots.changed().await.is_ok() {
             let snapshot = snapshots.borrow_and_update().clone();
             let estimate = &snapshot.estimate;
-            let is_new = estimate.stamp.is_some() && estimate.stamp != stamp;
+            let now = (estimate.stamp, estimate.pose_in_map);
+            let is_new = last.replace(now) != Some(now);
             if is_new && let Some(pose) = pose_message(estimate, &self.map_frame) {
-                stamp = estimate.stamp;
                 tell("pose", self.pose.put(ros::cdr(&pose)).await);
             }
             // With every processed scan the particles are other ones.

@@ -355,6 +355,16 @@ async fn until_map_of(maps: &mut UnboundedReceiver<Sample>, snapshot: &Snapshot)
     }
 }
 
+/// Receives poses until that of this snapshot comes.
+async fn until_pose_of(poses: &mut UnboundedReceiver<Sample>, snapshot: &Snapshot) {
+    loop {
+        let pose: PoseMessage = message(&next(poses).await);
+        if Some(stamp(pose.header.stamp)) == snapshot.estimate.stamp {
+            return;
+        }
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn who_subscribes_late_gets_the_newest_map_first_or_not() {
     let drive = drive();
@@ -378,6 +388,21 @@ async fn who_subscribes_late_gets_the_newest_map_first_or_not() {
     rig.show(newer);
     let (_third, mut maps) = late_joiner(&client, "map").await;
     until_map_of(&mut maps, newer).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_encoded_for_nobody() {
+    let drive = drive();
+    let rig = Rig::start(drive[3].clone()).await;
+    let mut poses = rig.subscribe("pose").await;
+    for snapshot in &drive[4..9] {
+        rig.show(snapshot);
+        until_pose_of(&mut poses, snapshot).await;
+    }
+    let (_subscriber, mut maps) = late_joiner(&rig.client, "map").await;
+    let map = next(&mut maps).await;
+    assert_eq!(map.source_info().unwrap().source_sn(), 0, "it is the first that was put");
+    assert_eq!(stamp(message::<ros::OccupancyGrid>(&map).header.stamp), version(&drive[8]).stamp);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -419,8 +444,7 @@ async fn maps_keep_their_distance_and_who_comes_anew_does_not_wait() {
     until_map_of(&mut maps, &drive[3]).await;
     for snapshot in &drive[4..6] {
         rig.show(snapshot);
-        let newest = snapshot.estimate.stamp;
-        while Some(stamp(message::<PoseMessage>(&next(&mut poses).await).header.stamp)) != newest {}
+        until_pose_of(&mut poses, snapshot).await;
     }
     leave(&rig, vec![first]).await;
     assert!(maps.try_recv().is_err(), "the hour has not passed");
