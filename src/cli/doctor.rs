@@ -122,7 +122,7 @@ async fn subscribe(
 fn readable(report: &Report) -> String {
     let mut text = String::new();
     for fact in &report.facts {
-        text += &format!("ok      {fact}\n");
+        text += &format!("seen    {fact}\n");
     }
     for finding in &report.findings {
         text += &format!("WRONG   {finding}\n        remedy: {}\n", finding.remedy());

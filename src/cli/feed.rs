@@ -45,6 +45,7 @@ pub(super) struct Feed {
     frames: Frames,
     /// Before the first reading; `None` if whoever listens is no gmapd.
     at_start: Option<Progress>,
+    last_odometry: Option<ros::Odometry>,
     backlog: Backlog,
     tally: BTreeMap<String, u64>,
 }
@@ -91,6 +92,7 @@ impl Feed {
             verdicts,
             frames: Frames::default(),
             at_start: None,
+            last_odometry: None,
             backlog: Backlog::default(),
             tally: BTreeMap::new(),
         })
@@ -143,8 +145,12 @@ impl Feed {
     /// Sends a reading.
     pub(super) async fn send(&mut self, reading: &Reading) -> anyhow::Result<()> {
         let Messages { odometry, scan } = self.frames.messages(reading);
-        self.odom.put(ros::cdr(&odometry)).await.map_err(|error| anyhow!(error))?;
-        self.backlog.odometry_sent();
+        // Logs may have the odometry of a scan on a line of its own, too.
+        if self.last_odometry.as_ref() != Some(&odometry) {
+            self.odom.put(ros::cdr(&odometry)).await.map_err(|error| anyhow!(error))?;
+            self.backlog.odometry_sent();
+            self.last_odometry = Some(odometry);
+        }
         if let Some(scan) = scan {
             self.scan.put(ros::cdr(&scan)).await.map_err(|error| anyhow!(error))?;
             self.backlog.scan_sent(reading.stamp);

@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use crate::logs::Reading;
-use crate::slam::pose::Stamp;
+use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::LaserMount;
 
 /// Between two readings of a log that has no two stamps in order, ns.
@@ -49,10 +49,34 @@ const fn place(mount: &LaserMount) -> [f64; 3] {
     [place.x, place.y, place.theta]
 }
 
+/// The last reading, to compare the next with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Last {
+    line: u64,
+    stamp: Stamp,
+    odom_from_base: Pose2,
+    has_scan: bool,
+}
+
+impl Last {
+    const fn new(reading: &Reading) -> Self {
+        let Reading { line, stamp, odom_from_base, .. } = *reading;
+        Self { line, stamp, odom_from_base, has_scan: reading.scan.is_some() }
+    }
+
+    /// Some logs have odometry on a line of its own and again with the sweep, of one stamp: they
+    /// are one reading.
+    fn is_one_with(&self, reading: &Reading) -> bool {
+        self.stamp == reading.stamp
+            && self.odom_from_base == reading.odom_from_base
+            && !(self.has_scan && reading.scan.is_some())
+    }
+}
+
 /// What has to be known of a log before it is played.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Survey {
-    last: Option<(u64, Stamp)>,
+    last: Option<Last>,
     /// Positive steps from stamp to stamp, ns.
     steps: Vec<i64>,
     mount: Option<LaserMount>,
@@ -64,10 +88,11 @@ impl Survey {
     /// Takes the next reading of the log.
     pub fn add(&mut self, reading: &Reading) {
         let Reading { line, stamp, mount, .. } = *reading;
-        if let Some((line_before, stamp_before)) = self.last.replace((line, stamp)) {
+        if let Some(last) = self.last.replace(Last::new(reading)) {
+            let (line_before, stamp_before) = (last.line, last.stamp);
             if stamp > stamp_before {
                 self.steps.push(stamp.0.saturating_sub(stamp_before.0));
-            } else {
+            } else if !last.is_one_with(reading) {
                 let fault = LogFault::StampOrder { line, stamp, line_before, stamp_before };
                 self.stamp_fault.get_or_insert(fault);
             }
@@ -112,11 +137,12 @@ impl Survey {
 }
 
 /// Changes as few stamps as it can.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Restamper {
     /// The median of the positive steps, ns.
     period: i64,
-    last: Option<Stamp>,
+    /// As it was, and the stamp it was given.
+    last: Option<(Last, Stamp)>,
 }
 
 impl Restamper {
@@ -124,10 +150,13 @@ impl Restamper {
     /// the usual period.
     pub fn restamp(&mut self, reading: &mut Reading) {
         let stamp = match self.last {
-            Some(last) if reading.stamp <= last => Stamp(last.0.saturating_add(self.period)),
-            _ => reading.stamp,
+            Some((last, given)) if last.is_one_with(reading) => given,
+            Some((_, given)) if reading.stamp <= given => {
+                Stamp(given.0.saturating_add(self.period))
+            }
+            Some(_) | None => reading.stamp,
         };
-        self.last = Some(stamp);
+        self.last = Some((Last::new(reading), stamp));
         reading.stamp = stamp;
         if let Some(scan) = &mut reading.scan {
             scan.stamp = stamp;
@@ -180,6 +209,25 @@ mod tests {
             "line 3 has the stamp 2.500000, which is not after 3.000000 of line 2"
         );
         assert!(survey(&[5, 5]).stamp_fault().is_some());
+    }
+
+    /// As in a log that writes odometry on a line of its own, and with the sweep again.
+    #[test]
+    fn odometry_that_is_repeated_with_a_scan_is_in_order() {
+        let odometry = |line, stamp| Reading { scan: None, ..reading(line, stamp) };
+        let pairs = [odometry(1, 10), reading(2, 10), odometry(3, 20), reading(4, 20)];
+        let mut survey = Survey::default();
+        pairs.iter().for_each(|reading| survey.add(reading));
+        assert_eq!(survey.stamp_fault(), None);
+        let mut restamper = survey.clone().restamper();
+        let stamps = pairs.map(|mut reading| {
+            restamper.restamp(&mut reading);
+            reading.stamp.0
+        });
+        assert_eq!(stamps, [10, 10, 20, 20]);
+        let elsewhere = Pose2::new(1.0, 0.0, 0.0);
+        survey.add(&Reading { odom_from_base: elsewhere, ..odometry(5, 20) });
+        assert!(survey.stamp_fault().is_some());
     }
 
     #[test]
