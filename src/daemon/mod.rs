@@ -367,9 +367,9 @@ async fn subscribe(
 }
 
 /// The status as those ask for it that serve it.
-fn asked(status: &Arc<StatusSource>) -> serving::StatusSource {
+fn asked(status: &Arc<StatusSource>) -> serving::AskStatus {
     let status = Arc::clone(status);
-    serving::StatusSource::new(move || status.status())
+    serving::AskStatus::new(move || status.status())
 }
 
 fn tell_keys(keys: &InputKeys) {
