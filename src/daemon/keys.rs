@@ -95,11 +95,14 @@ fn name(names: &Keys, input: Input) -> &str {
 }
 
 fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
-    let key = KeyExpr::autocanonize(text.to_owned())
-        .map_err(|error| KeyError::Invalid { key: text.to_owned(), reason: error.to_string() })?;
-    if key.is_wild() {
+    if text.contains(['*', '$']) {
         return Err(KeyError::Wildcard(text.to_owned()));
     }
+    let key = KeyExpr::autocanonize(text.to_owned()).map_err(|error| {
+        // Zenoh adds where in its own sources it said so.
+        let reason = error.to_string().split(" at /").next().unwrap_or_default().to_owned();
+        KeyError::Invalid { key: text.to_owned(), reason }
+    })?;
     Ok(key.into())
 }
 
