@@ -15,7 +15,7 @@ use super::command::{Command, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
 use super::save::{SaveError, SaveName, Saver};
 use super::selector::{MapFormat, MessageFormat, PathFormat, Question, SelectorError};
-use super::serving::{Settings, StatusSource};
+use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
 use crate::convert;
 use crate::ros;
@@ -78,7 +78,7 @@ fn seconds(stamp: Stamp) -> String {
 #[derive(Debug)]
 pub(super) struct Responder {
     snapshots: watch::Receiver<Arc<Snapshot>>,
-    status: StatusSource,
+    status: AskStatus,
     commands: mpsc::Sender<Request>,
     products: Arc<ProductCache>,
     saver: Saver,
@@ -89,7 +89,7 @@ impl Responder {
     pub(super) fn new(
         settings: &Settings,
         snapshots: watch::Receiver<Arc<Snapshot>>,
-        status: StatusSource,
+        status: AskStatus,
         commands: mpsc::Sender<Request>,
     ) -> Self {
         let empty = EmptyMap { frame: settings.map_frame.clone(), resolution: settings.resolution };

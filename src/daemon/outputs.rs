@@ -26,7 +26,7 @@ use super::keys::Prefix;
 use super::ledger::Entry;
 use super::message_clock::MessageClock;
 use super::selector::{MessageFormat, PathFormat};
-use super::serving::{ServingError, Settings, StatusSource};
+use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
 use crate::clock::Stopwatch;
 use crate::convert;
@@ -102,7 +102,7 @@ impl Declare<'_> {
     /// `diagnostics`.
     pub(super) async fn diagnostics(
         &self,
-        status: StatusSource,
+        status: AskStatus,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
         let publisher = self.plain("diagnostics", cdr_of::<ros::DiagnosticArray>()).await?;
@@ -289,15 +289,15 @@ struct EstimateOutputs {
 
 impl EstimateOutputs {
     async fn run(self, mut snapshots: Snapshots) {
-        let mut stamp = None;
+        let mut last = None;
         let mut particles: Arc<[Pose2]> = Arc::new([]);
         snapshots.mark_changed();
         while snapshots.changed().await.is_ok() {
             let snapshot = snapshots.borrow_and_update().clone();
             let estimate = &snapshot.estimate;
-            let is_new = estimate.stamp.is_some() && estimate.stamp != stamp;
+            let now = (estimate.stamp, estimate.pose_in_map);
+            let is_new = last.replace(now) != Some(now);
             if is_new && let Some(pose) = pose_message(estimate, &self.map_frame) {
-                stamp = estimate.stamp;
                 tell("pose", self.pose.put(ros::cdr(&pose)).await);
             }
             // With every processed scan the particles are other ones.
@@ -359,7 +359,7 @@ async fn publish_transform(
     }
 }
 
-async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: StatusSource) {
+async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: AskStatus) {
     let mut ticks = tokio::time::interval(DIAGNOSTICS_PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {

@@ -1,11 +1,10 @@
 //! The queryables: every query gets an answer or one sentence that says why not.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc};
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, spawn_blocking};
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::query::{Query, Queryable};
@@ -24,9 +23,6 @@ const COMMANDS_AT_ONCE: usize = 8;
 
 /// Queries beyond those that wait to hear that they are too many; more end without a reply.
 const REFUSALS_WAITING: usize = 256;
-
-/// How long a stop waits for the replies that are being sent.
-const LONGEST_STOP: Duration = Duration::from_millis(500);
 
 /// What a robot answers, while this lives.
 #[derive(Debug)]
@@ -80,21 +76,21 @@ impl Queryables {
         Ok(Self { declared, counter, refusals })
     }
 
-    /// Takes no more queries, and gives those that are being answered a moment.
+    /// Takes no more queries, and waits until those that came are answered.
     pub(super) async fn stop(self) {
-        for queryable in self.declared {
-            if let Err(error) = queryable.undeclare().await {
-                tracing::debug!(%error, "a queryable could not be undeclared");
+        let Self { declared, counter, refusals } = self;
+        // It blocks while the network is slow.
+        let undeclare = move || {
+            for queryable in declared {
+                if let Err(error) = queryable.undeclare().wait() {
+                    tracing::debug!(%error, "a queryable could not be undeclared");
+                }
             }
-        }
-        let all_answered = async {
-            self.counter.answers.acquire_many(ANSWERS_AT_ONCE as u32).await.ok();
-            self.counter.commands.acquire_many(COMMANDS_AT_ONCE as u32).await.ok();
         };
-        if tokio::time::timeout(LONGEST_STOP, all_answered).await.is_err() {
-            tracing::debug!("stopped while queries were being answered");
-        }
-        self.refusals.abort();
+        spawn_blocking(undeclare).await.ok();
+        counter.answers.acquire_many(ANSWERS_AT_ONCE as u32).await.ok();
+        counter.commands.acquire_many(COMMANDS_AT_ONCE as u32).await.ok();
+        refusals.abort();
     }
 }
 
@@ -150,6 +146,6 @@ async fn refuse_all(mut waiting: mpsc::Receiver<Query>) {
             let refusal = Refusal::TooMany(ANSWERS_AT_ONCE).to_string();
             query.reply_err(refusal).encoding(Encoding::TEXT_PLAIN).wait().ok();
         };
-        tokio::task::spawn_blocking(refuse).await.ok();
+        spawn_blocking(refuse).await.ok();
     }
 }

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use thiserror::Error;
 use tokio::sync::{broadcast, mpsc, watch};
-use tokio::task::JoinSet;
-use zenoh::Session;
+use tokio::task::{JoinSet, spawn_blocking};
 use zenoh::key_expr::OwnedKeyExpr;
 use zenoh::liveliness::LivelinessToken;
+use zenoh::{Session, Wait as _};
 
 use super::answers::Responder;
 use super::command::Request;
@@ -24,6 +24,9 @@ use crate::config::Config;
 
 /// The key under the prefix of the token that lives as long as the daemon answers.
 pub const ALIVE: &str = "slam/alive";
+
+/// How long a stop waits for what is being sent.
+const LONGEST_STOP: Duration = Duration::from_millis(300);
 
 /// How things are served.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,9 +71,9 @@ fn duration(seconds: f64) -> Duration {
 
 /// Asks how the daemon is.
 #[derive(Clone)]
-pub struct StatusSource(Arc<dyn Fn() -> Status + Send + Sync>);
+pub struct AskStatus(Arc<dyn Fn() -> Status + Send + Sync>);
 
-impl StatusSource {
+impl AskStatus {
     /// Asks this function, on any thread.
     #[must_use]
     pub fn new(status: impl Fn() -> Status + Send + Sync + 'static) -> Self {
@@ -84,9 +87,9 @@ impl StatusSource {
     }
 }
 
-impl fmt::Debug for StatusSource {
+impl fmt::Debug for AskStatus {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter.debug_struct("StatusSource").finish_non_exhaustive()
+        formatter.debug_struct("AskStatus").finish_non_exhaustive()
     }
 }
 
@@ -100,7 +103,7 @@ pub struct Sources {
     /// Takes commands to the filter.
     pub commands: mpsc::Sender<Request>,
     /// Tells how the daemon is.
-    pub status: StatusSource,
+    pub status: AskStatus,
 }
 
 /// Why nothing can be served.
@@ -156,12 +159,22 @@ impl Serving {
         Ok(Self { alive, queryables, outputs: tasks })
     }
 
-    /// Takes the token back, answers no more queries, and publishes nothing more; within a second.
-    pub async fn stop(mut self) {
-        if let Err(error) = self.alive.undeclare().await {
-            tracing::debug!(%error, "the token of life could not be undeclared");
+    /// Takes the token back, answers no more queries, and publishes nothing more.
+    ///
+    /// It takes a moment at most: replies that have not been sent by then are not sent at all.
+    pub async fn stop(self) {
+        let Self { alive, queryables, mut outputs } = self;
+        let stop = async move {
+            // It blocks while the network is slow.
+            let undeclare = move || alive.undeclare().wait();
+            if let Ok(Err(error)) = spawn_blocking(undeclare).await {
+                tracing::debug!(%error, "the token of life could not be undeclared");
+            }
+            queryables.stop().await;
+            outputs.shutdown().await;
+        };
+        if tokio::time::timeout(LONGEST_STOP, stop).await.is_err() {
+            tracing::debug!("stopped while something was being sent");
         }
-        self.queryables.stop().await;
-        self.outputs.shutdown().await;
     }
 }

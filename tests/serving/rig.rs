@@ -1,13 +1,14 @@
 //! A daemon's serving part between made-up sources and real sessions on loopback.
 
 use std::collections::BTreeMap;
+use std::fmt::Debug;
 use std::sync::Arc;
 use std::time::Duration;
 
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::ledger::{Entry, Ledger};
-use gmapd::daemon::serving::{Serving, Settings, Sources, StatusSource};
+use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
 use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
 use gmapd::daemon::status::{FilterStatus, Status};
 use gmapd::ros;
@@ -17,6 +18,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::{broadcast, mpsc, watch};
 use zenoh::Session;
 use zenoh::sample::{Sample, SampleKind};
+use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
 use crate::support::{add, filter, full_circle, parameters, room, route, shots};
 
@@ -138,6 +140,16 @@ impl Rig {
 
     /// Serves on one session, and waits until the other knows.
     pub(crate) async fn between(daemon: Session, client: Session, first: Snapshot) -> Self {
+        Self::with_interval(daemon, client, first, Duration::ZERO).await
+    }
+
+    /// With a time between two maps.
+    pub(crate) async fn with_interval(
+        daemon: Session,
+        client: Session,
+        first: Snapshot,
+        map_update_interval: Duration,
+    ) -> Self {
         let directory = tempfile::tempdir().expect("there is a place for temporary files");
         let (snapshots, watched) = watch::channel(Arc::new(first));
         let (verdicts, heard) = broadcast::channel(16);
@@ -146,7 +158,7 @@ impl Rig {
             map_frame: "map".to_owned(),
             odom_frame: "odom".to_owned(),
             resolution: 0.05,
-            map_update_interval: Duration::ZERO,
+            map_update_interval,
             transform_publish_period: Duration::from_millis(20),
             tf_delay_s: 0.02,
             save_directory: directory.path().join("maps"),
@@ -155,7 +167,7 @@ impl Rig {
             snapshots: watched,
             verdicts: heard,
             commands: commander,
-            status: StatusSource::new(status),
+            status: AskStatus::new(status),
         };
         let prefix = Prefix::parse(ROBOT).expect("it is a key");
         let serving = Serving::start(&daemon, &prefix, settings, sources).await;
@@ -178,6 +190,18 @@ impl Rig {
         let answer = self.ask(selector).await.expect(selector);
         assert_eq!(answer.encoding, format!("application/cdr;{}", M::TYPE));
         ros::decode(&answer.bytes, "").expect(selector)
+    }
+
+    /// What a message says that is the same as CDR, as JSON, and when no format is asked for.
+    pub(crate) async fn ask_both<M: ros::Message + PartialEq + Debug>(&self, name: &str) -> M {
+        let message: M = self.ask_message(&format!("{name}?format=cdr")).await;
+        for selector in [name, &format!("{name}?format=json")] {
+            let answer = self.ask(selector).await.expect(selector);
+            assert_eq!(answer.encoding, format!("application/json;{}", M::TYPE));
+            let same: M = ros::decode(&answer.bytes, &answer.encoding).expect(selector);
+            assert_eq!(same, message, "{selector}");
+        }
+        message
     }
 
     pub(crate) async fn ask_json(&self, selector: &str) -> serde_json::Value {
@@ -220,6 +244,34 @@ pub(crate) async fn next<T>(receiver: &mut UnboundedReceiver<T>) -> T {
 pub(crate) fn message<M: ros::Message>(sample: &Sample) -> M {
     assert_eq!(sample.encoding().to_string(), format!("application/cdr;{}", M::TYPE));
     ros::decode(&sample.payload().to_bytes(), "").expect(M::TYPE)
+}
+
+/// What RViz and nav2 are behind a bridge.
+pub(crate) async fn late_joiner(
+    session: &Session,
+    name: &str,
+) -> (AdvancedSubscriber<()>, UnboundedReceiver<Sample>) {
+    let (sender, receiver) = mpsc::unbounded_channel();
+    let subscriber = session
+        .declare_subscriber(format!("{ROBOT}/{name}"))
+        .history(HistoryConfig::default().detect_late_publishers().max_samples(1))
+        .callback(move |sample| drop(sender.send(sample)))
+        .await;
+    (subscriber.expect("it is a key"), receiver)
+}
+
+/// Ends subscriptions to the map, and waits until the daemon knows that nobody is left.
+pub(crate) async fn leave(rig: &Rig, subscribers: Vec<AdvancedSubscriber<()>>) {
+    let publisher = rig.daemon.declare_publisher(format!("{ROBOT}/map")).await;
+    let publisher = publisher.expect("it is a key");
+    let matching = publisher.matching_listener().await.expect("it is declared");
+    for subscriber in subscribers {
+        subscriber.undeclare().await.expect("it is declared");
+    }
+    while publisher.matching_status().await.expect("it is declared").matching() {
+        let change = tokio::time::timeout(PATIENCE, matching.recv_async()).await;
+        change.expect("it comes in time").expect("the publisher lives");
+    }
 }
 
 /// A reply.
