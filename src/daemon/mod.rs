@@ -38,7 +38,7 @@ use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryCo
 
 use self::command::Request;
 use self::input::{Inbox, Input};
-use self::keys::{InputKeys, KeyError, Prefix};
+use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
@@ -65,7 +65,7 @@ const COMMANDS: usize = 16;
 const STATIC_TRANSFORMS: usize = 100;
 
 /// How often the state is looked at, to log what changed.
-const LOOK: Duration = Duration::from_secs(1);
+const LOOK: Duration = Duration::from_secs(2);
 
 /// What to run.
 #[derive(Debug, Clone)]
@@ -94,12 +94,12 @@ pub enum DaemonError {
     #[error(transparent)]
     Serving(#[from] ServingError),
     /// Zenoh takes no subscriber.
-    #[error("cannot subscribe to {key}")]
+    #[error("cannot subscribe to {key}: {reason}")]
     Subscribe {
         /// The key.
         key: String,
         /// What Zenoh says.
-        source: zenoh::Error,
+        reason: String,
     },
     /// A bug: the thread `mapper` ended though nobody asked it to.
     #[error("the thread that maps ended unexpectedly")]
@@ -298,7 +298,7 @@ async fn subscribe(
 ) -> Result<Subscribers, DaemonError> {
     let failed = |input| {
         let key = keys.of(input).to_string();
-        move |source| DaemonError::Subscribe { key, source }
+        move |error| DaemonError::Subscribe { key, reason: plain_message(&error) }
     };
     let mut changing = Vec::new();
     for input in [Input::Tf, Input::Odom, Input::Scan] {
