@@ -4,6 +4,13 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
+/// What this machine's clock says, as the stamps of messages count: nanoseconds since 1970.
+#[must_use]
+pub fn unix_nanoseconds() -> i64 {
+    let time = clock_gettime(ClockId::Realtime);
+    time.tv_sec.saturating_mul(1_000_000_000).saturating_add(time.tv_nsec)
+}
+
 /// The time now, to compare with other times of this process.
 #[must_use]
 #[allow(clippy::disallowed_methods, reason = "this module is where clocks are read")]

@@ -115,6 +115,22 @@ pub fn scan(message: ros::LaserScan) -> Result<Scan, ConvertError> {
     Ok(Scan { stamp: stamp(message.header.stamp)?, geometry, ranges: message.ranges })
 }
 
+/// A sweep as the message that [`scan`] reads; angles and range limits keep the digits of an `f32`.
+#[must_use]
+pub fn laser_scan(scan: &Scan, frame: &str) -> ros::LaserScan {
+    let Scan { stamp, geometry, ranges } = scan;
+    ros::LaserScan {
+        header: header(*stamp, frame),
+        angle_min: geometry.angle(0) as f32,
+        angle_max: geometry.angle(ranges.len().saturating_sub(1)) as f32,
+        angle_increment: geometry.angle_increment() as f32,
+        range_min: geometry.range_min() as f32,
+        range_max: geometry.range_max() as f32,
+        ranges: ranges.clone(),
+        ..ros::LaserScan::default()
+    }
+}
+
 /// What odometry says.
 ///
 /// # Errors
@@ -128,6 +144,18 @@ pub fn odometry(message: ros::Odometry) -> Result<OdometrySample, ConvertError> 
         base_frame: message.child_frame_id,
         odom_from_base: base_pose(&odom_from_base)?,
     })
+}
+
+/// What odometry says as the message that [`odometry`] reads; it knows no speed.
+#[must_use]
+pub fn odometry_message(sample: &OdometrySample) -> ros::Odometry {
+    let pose = pose(sample.odom_from_base);
+    ros::Odometry {
+        header: header(sample.stamp, &sample.odom_frame),
+        child_frame_id: sample.base_frame.clone(),
+        pose: ros::PoseWithCovariance { pose, ..ros::PoseWithCovariance::default() },
+        twist: ros::TwistWithCovariance::default(),
+    }
 }
 
 /// The transform between two frames.
@@ -186,6 +214,25 @@ pub fn laser_mount(base_from_laser: &Isometry3<f64>) -> Result<LaserMount, Conve
     let orientation =
         if upward > 0.0 { MountOrientation::Upright } else { MountOrientation::UpsideDown };
     Ok(LaserMount { base_from_laser: in_plane(base_from_laser), orientation })
+}
+
+/// How a laser sits as the transform that [`laser_mount`] reads; the header's frame is the base.
+#[must_use]
+pub fn mount_transform(
+    header: ros::Header,
+    laser_frame: &str,
+    mount: &LaserMount,
+) -> ros::TransformStamped {
+    let mut message = transform_stamped(header, laser_frame, mount.base_from_laser);
+    let ros::Quaternion { z, w, .. } = message.transform.rotation;
+    match mount.orientation {
+        MountOrientation::Upright => {}
+        // Half a turn about the laser's own x axis, before the turn about z.
+        MountOrientation::UpsideDown => {
+            message.transform.rotation = ros::Quaternion { x: w, y: z, z: 0.0, w: 0.0 };
+        }
+    }
+    message
 }
 
 /// Between the z axes before and after a rotation, rad.

@@ -16,7 +16,7 @@ pub use absolute::{Alignment, absolute_errors};
 pub use relations::{ErrorStatistics, Relation, RelationReport, Skipped, relation_errors};
 pub use revisit::{RevisitAgreement, revisit_agreement};
 pub use text::{
-    TextError, parse_relations, parse_trajectory, read_relations, read_trajectory, tum,
+    TextError, parse_relations, parse_trajectory, read_relations, read_trajectory, tum, tum_of_path,
 };
 
 use crate::slam::pose::{Pose2, Stamp};

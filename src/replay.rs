@@ -1,5 +1,8 @@
 //! Runs the filter over recorded readings, one after the other and as fast as it goes.
 //!
+//! Each reading passes once through the ROS messages that would carry it over a mesh, so that a
+//! replay gives what the daemon gives for the same log, byte for byte.
+//!
 //! The result depends on the readings, the configuration and the seed alone; the figures about
 //! time and memory come from [`crate::clock`].
 
@@ -13,6 +16,7 @@ pub use summary::{
 
 use crate::clock::{Elapsed, Stopwatch};
 use crate::config::Config;
+use crate::convert::{self, OdometrySample};
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
 use crate::slam::gmapping::{
@@ -54,9 +58,13 @@ impl Replay {
 
     /// Takes the next reading of the log.
     pub fn add(&mut self, reading: &Reading) -> Verdict {
-        let step = self.add_odometry(reading);
+        let odom_from_base = odometry_as_received(reading);
+        let step = self.add_odometry(reading.stamp, odom_from_base);
         let verdict = match (&reading.scan, step) {
-            (Some(scan), _) => self.add_scan(reading, scan),
+            (Some(scan), _) => match scan_as_received(scan) {
+                Some(scan) => self.add_scan(&scan, &reading.mount, odom_from_base),
+                None => Verdict::BadGeometry,
+            },
             (None, OdometryUpdate::NotUsable) => Verdict::BadOdometry,
             (None, OdometryUpdate::Accepted | OdometryUpdate::JumpRejected) => {
                 Verdict::OdometryOnly
@@ -69,9 +77,11 @@ impl Replay {
     /// Ends the replay: the map, and the trajectory as the best particle sees it now.
     #[must_use]
     pub fn finish(self) -> Outcome {
+        let path = self.filter.path();
         Outcome {
             map: self.filter.occupancy_grid(),
-            trajectory: self.track.corrected(&self.filter.path()),
+            trajectory: self.track.corrected(&path),
+            path,
             tiles: self.filter.particle_tiles().into(),
             counts: self.counts,
             sample_sizes: self.sample_sizes,
@@ -81,16 +91,15 @@ impl Replay {
     }
 
     /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
-    fn add_odometry(&mut self, reading: &Reading) -> OdometryUpdate {
-        let odom_from_base = reading.odom_from_base;
+    fn add_odometry(&mut self, stamp: Stamp, odom_from_base: Pose2) -> OdometryUpdate {
         let step = self.filter.add_odometry(odom_from_base);
-        self.track.add(reading.stamp, odom_from_base, step);
+        self.track.add(stamp, odom_from_base, step);
         step
     }
 
-    fn add_scan(&mut self, reading: &Reading, scan: &Scan) -> Verdict {
-        let mount = self.mount.as_ref().unwrap_or(&reading.mount);
-        let reading = ScanReading { scan, mount, odom_from_base: reading.odom_from_base };
+    fn add_scan(&mut self, scan: &Scan, mount: &LaserMount, odom_from_base: Pose2) -> Verdict {
+        let mount = &self.mount.unwrap_or_else(|| mount_as_received(mount));
+        let reading = ScanReading { scan, mount, odom_from_base };
         let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();
         let mut phase_watch = total;
@@ -118,6 +127,29 @@ impl Replay {
     }
 }
 
+/// A pose that no message can carry is left to the filter to refuse.
+fn odometry_as_received(reading: &Reading) -> Pose2 {
+    let sample = OdometrySample {
+        stamp: reading.stamp,
+        odom_frame: String::new(),
+        base_frame: String::new(),
+        odom_from_base: reading.odom_from_base,
+    };
+    let received = convert::odometry(convert::odometry_message(&sample));
+    received.map_or(sample.odom_from_base, |received| received.odom_from_base)
+}
+
+fn scan_as_received(scan: &Scan) -> Option<Scan> {
+    convert::scan(convert::laser_scan(scan, "")).ok()
+}
+
+fn mount_as_received(mount: &LaserMount) -> LaserMount {
+    let message = convert::mount_transform(convert::header(Stamp(0), ""), "", mount);
+    let received = convert::transform(message)
+        .and_then(|transform| convert::laser_mount(&transform.parent_from_child));
+    received.unwrap_or(*mount)
+}
+
 /// What a replay leaves.
 #[derive(Debug)]
 pub struct Outcome {
@@ -125,6 +157,8 @@ pub struct Outcome {
     pub map: Option<OccupancyGrid>,
     /// The pose of the base in `map` at every reading.
     pub trajectory: Vec<StampedPose>,
+    /// The pose of the base in `map` at every processed scan.
+    pub path: Path,
     /// Tiles of the particles' maps.
     pub tiles: Tiles,
     /// Readings by verdict.
@@ -150,6 +184,8 @@ pub enum Verdict {
     NoUsableBeams,
     /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
+    /// The angles or limits of its scan are none when written with the digits of a message.
+    BadGeometry,
     /// It has no scan.
     OdometryOnly,
 }

@@ -193,7 +193,9 @@ fn processed(log: &CarmenLog, config: &Config) -> u64 {
             Verdict::Processed => processed += 1,
             Verdict::NotMovedEnough | Verdict::NoUsableBeams => passed_over += 1,
             Verdict::OdometryOnly => without += 1,
-            verdict @ (Verdict::Throttled | Verdict::BadOdometry) => panic!("{verdict:?}"),
+            verdict @ (Verdict::Throttled | Verdict::BadOdometry | Verdict::BadGeometry) => {
+                panic!("{verdict:?}")
+            }
         }
     }
     let statistics = log.statistics();

@@ -66,7 +66,7 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 15] = [
+const MAY_USE: [(&str, &[&str]); 17] = [
     ("slam", &[]),
     ("sim", &["slam"]),
     ("logs", &["slam"]),
@@ -75,7 +75,14 @@ const MAY_USE: [(&str, &[&str]); 15] = [
     ("convert", &["ros", "slam", "tf"]),
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
-    ("replay", &["clock", "config", "evaluation", "logs", "slam", "statistics"]),
+    ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
+    // Its tests read what the daemon writes.
+    ("playback", &["convert", "daemon", "logs", "ros", "slam"]),
+    (
+        "doctor",
+        // Its tests watch simulated robots.
+        &["convert", "playback", "ros", "sim", "slam", "statistics", "tf", "timeline"],
+    ),
     ("map", &["slam", "statistics"]),
     ("evaluation", &["slam", "statistics"]),
     (
@@ -103,7 +110,7 @@ const MAY_USE: [(&str, &[&str]); 15] = [
 ];
 
 /// Words that a module must not have, beside those its row above rules out.
-const NEVER: [(&str, &[&str]); 8] = [
+const NEVER: [(&str, &[&str]); 10] = [
     ("sim", &["tokio", "zenoh", "Instant", "SystemTime", "std::fs"]),
     // The vocabulary of poses and scans, and not the filter.
     ("logs", &["tokio", "zenoh", "slam::gmapping", "slam::grid"]),
@@ -113,6 +120,8 @@ const NEVER: [(&str, &[&str]); 8] = [
     ("timeline", &["tokio", "zenoh", "Instant", "SystemTime"]),
     ("tf", &["tokio", "zenoh", "Instant", "SystemTime"]),
     ("map", &["tokio", "zenoh", "slam::gmapping"]),
+    ("playback", &["tokio", "zenoh", "slam::gmapping", "Instant", "SystemTime"]),
+    ("doctor", &["tokio", "zenoh", "slam::gmapping", "Instant", "SystemTime"]),
 ];
 
 fn root() -> &'static Path {

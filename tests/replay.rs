@@ -130,6 +130,7 @@ fn each_reading_has_a_verdict() {
         "throttled",
         "no_usable_beams",
         "bad_odometry",
+        "bad_geometry",
         "odometry_only",
     ]
     .iter()

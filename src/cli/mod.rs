@@ -1,10 +1,18 @@
 //! The subcommands: one file each.
 
+mod demo;
+mod doctor;
 mod evaluate;
+mod feed;
+mod get;
+mod list;
+mod mesh;
+mod play;
 mod progress;
+mod readable;
 mod replay;
 mod run;
-#[allow(dead_code, reason = "open() is for subcommands that follow")]
+mod save;
 mod session;
 mod simulate;
 
@@ -15,7 +23,10 @@ use clap::{Parser, Subcommand};
 #[command(
     version,
     after_help = "Examples:\n  \
+        gmapd demo                                     a simulated robot and its map, in a minute\n  \
         gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
+        gmapd get robot01 map                          a robot's map, drawn\n  \
+        gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
         gmapd replay run.log --out out                 map a recorded run\n  \
         gmapd replay run.log --set particles=60        with more particles\n  \
@@ -33,6 +44,18 @@ pub(crate) struct Arguments {
 pub(crate) enum Command {
     /// Map live: scans and odometry from a Zenoh mesh, map and pose to it
     Run(run::Arguments),
+    /// See it work: a simulated robot and its map
+    Demo(demo::Arguments),
+    /// Send a recorded run onto the mesh
+    Play(play::Arguments),
+    /// Ask a robot for its map, pose, path or status
+    Get(get::Arguments),
+    /// Save a robot's map here: PGM and YAML
+    Save(save::Arguments),
+    /// List the robots that are alive
+    List(list::Arguments),
+    /// Watch a robot's input and say what is wrong
+    Doctor(doctor::Arguments),
     /// Map a recorded run
     Replay(replay::Arguments),
     /// Drive a simulated robot and record what it sees
@@ -45,6 +68,12 @@ pub(crate) enum Command {
 pub(crate) fn run(command: Command) -> anyhow::Result<()> {
     match command {
         Command::Run(arguments) => run::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::Play(arguments) => play::run(&arguments),
+        Command::Get(arguments) => get::run(&arguments),
+        Command::Save(arguments) => save::run(&arguments),
+        Command::List(arguments) => list::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),

@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use clap::Args;
 use gmapd::clock::Stopwatch;
 use gmapd::config::Config;
-use gmapd::evaluation::tum;
+use gmapd::evaluation::{tum, tum_of_path};
 use gmapd::files::write_atomically;
 use gmapd::logs::LogStatistics;
 use gmapd::logs::carmen::CarmenLog;
@@ -28,7 +28,8 @@ const MALFORMED_SHOWN: usize = 10;
 #[command(after_help = "\
     The log is in CARMEN's format, plain or gzipped: FLASER, ROBOTLASER1, ODOM and PARAM lines\n\
     are used, others are counted. It is replayed in file order, as fast as it goes.\n\
-    The same log, configuration and seed give the same map on any number of threads.\n\n\
+    The same log, configuration and seed give the same map on any number of threads, and\n\
+    the map and the path that gmapd run makes of the log when gmapd play sends it.\n\n\
     With --out DIR: map.pgm and map.yaml (nav2's map_server loads them), map.png (to look at),\n\
     trajectory.tum (evo opens it) and summary.json. Without, only the summary is printed.\n\n\
     Examples:\n  \
@@ -127,6 +128,8 @@ struct Products {
     map: Option<Vec<u8>>,
     /// `trajectory.tum`.
     trajectory: Vec<u8>,
+    /// What the daemon answers for `path?format=tum`.
+    path: Vec<u8>,
 }
 
 impl Products {
@@ -134,11 +137,16 @@ impl Products {
         Self {
             map: outcome.map.as_ref().map(map::pgm),
             trajectory: tum(&outcome.trajectory).into_bytes(),
+            path: tum_of_path(&outcome.path).into_bytes(),
         }
     }
 
     fn hashes(&self) -> Hashes {
-        Hashes { map: self.map.as_deref().map(sha256), trajectory: sha256(&self.trajectory) }
+        Hashes {
+            map: self.map.as_deref().map(sha256),
+            trajectory: sha256(&self.trajectory),
+            path: sha256(&self.path),
+        }
     }
 
     fn write(&self, directory: &Path, outcome: &Outcome) -> anyhow::Result<Vec<PathBuf>> {
@@ -211,6 +219,7 @@ fn readable(summary: &Summary, written: &[PathBuf]) -> String {
     );
     line("map SHA-256", summary.sha256.map.clone().unwrap_or_else(|| "no map".to_owned()));
     line("trajectory", summary.sha256.trajectory.clone());
+    line("path", summary.sha256.path.clone());
     for path in written {
         line("wrote", path.display().to_string());
     }
@@ -224,6 +233,7 @@ fn readings(summary: &Summary) -> String {
         (counts.throttled, "throttled"),
         (counts.no_usable_beams, "without usable beams"),
         (counts.bad_odometry, "with bad odometry"),
+        (counts.bad_geometry, "with bad geometry"),
         (counts.odometry_only, "odometry only"),
         (counts.jump_rejected, "jumps rejected"),
         (counts.malformed, "malformed lines"),

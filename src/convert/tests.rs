@@ -14,7 +14,7 @@ fn mounted(rotation: UnitQuaternion<f64>) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::new(0.2, -0.1, 1.5), rotation)
 }
 
-fn laser_scan() -> ros::LaserScan {
+fn laser_scan_message() -> ros::LaserScan {
     ros::LaserScan {
         header: header(Stamp(1_700_000_000_250_000_000), "laser"),
         angle_min: -0.5,
@@ -27,7 +27,7 @@ fn laser_scan() -> ros::LaserScan {
     }
 }
 
-fn odometry_message(orientation: ros::Quaternion) -> ros::Odometry {
+fn turned_odometry(orientation: ros::Quaternion) -> ros::Odometry {
     let position = ros::Point { x: 1.0, y: 2.0, z: 0.1 };
     let pose = ros::Pose { position, orientation };
     ros::Odometry {
@@ -40,7 +40,7 @@ fn odometry_message(orientation: ros::Quaternion) -> ros::Odometry {
 
 #[test]
 fn a_scan_keeps_its_stamp_geometry_and_ranges() {
-    let scan = scan(laser_scan()).unwrap();
+    let scan = scan(laser_scan_message()).unwrap();
     assert_eq!(scan.stamp, Stamp(1_700_000_000_250_000_000));
     assert_eq!([scan.geometry.angle(0), scan.geometry.angle(4)], [-0.5, 0.5]);
     assert_eq!(scan.geometry.range_max(), 30.0);
@@ -50,10 +50,23 @@ fn a_scan_keeps_its_stamp_geometry_and_ranges() {
 }
 
 #[test]
+fn a_scan_survives_messages_but_for_the_digits_of_its_angles() {
+    let first = scan(laser_scan_message()).unwrap();
+    let again = scan(laser_scan(&first, "laser")).unwrap();
+    assert_eq!((again.stamp, again.geometry), (first.stamp, first.geometry));
+    assert_eq!(again.ranges[..3], first.ranges[..3]);
+    let clockwise = ScanGeometry::new([PI, -PI], -0.001, [0.02, f64::INFINITY]).unwrap();
+    let swept = Scan { geometry: clockwise, ..first };
+    let again = scan(laser_scan(&swept, "laser")).unwrap().geometry;
+    assert_eq!(again.range_max(), f64::INFINITY);
+    assert!((again.angle(1000) - clockwise.angle(1000)).abs() < 1e-6, "{again:?}");
+}
+
+#[test]
 fn an_unusable_scan_is_an_error() {
-    let error = scan(ros::LaserScan { angle_increment: 0.0, ..laser_scan() }).unwrap_err();
+    let error = scan(ros::LaserScan { angle_increment: 0.0, ..laser_scan_message() }).unwrap_err();
     assert_eq!(error, ConvertError::Geometry(GeometryError::Increment(0.0)));
-    let mut late = laser_scan();
+    let mut late = laser_scan_message();
     late.header.stamp.nanosec = 1_000_000_000;
     assert_eq!(
         scan(late).unwrap_err().to_string(),
@@ -64,7 +77,7 @@ fn an_unusable_scan_is_an_error() {
 #[test]
 fn odometry_keeps_its_frames_and_pose() {
     let turned = ros::Quaternion { z: 0.6 * 3.0, w: 0.8 * 3.0, ..ros::Quaternion::default() };
-    let sample = odometry(odometry_message(turned)).unwrap();
+    let sample = odometry(turned_odometry(turned)).unwrap();
     assert_eq!((sample.stamp, sample.odom_frame.as_str()), (Stamp(5), "odom"));
     assert_eq!(sample.base_frame, "base_link");
     let expected = Pose2::new(1.0, 2.0, 2.0 * 0.6_f64.atan2(0.8));
@@ -86,17 +99,17 @@ fn odometry_on_a_ramp_keeps_its_heading_and_a_tipped_base_is_refused() {
 
 #[test]
 fn what_is_no_rotation_or_no_position_is_refused() {
-    let error = odometry(odometry_message(ros::Quaternion::default())).unwrap_err();
+    let error = odometry(turned_odometry(ros::Quaternion::default())).unwrap_err();
     assert_eq!(
         error.to_string(),
         "the quaternion (x 0, y 0, z 0, w 0) is no rotation: its length is 0"
     );
     for w in [f64::NAN, f64::INFINITY, 1e300] {
         let quaternion = ros::Quaternion { w, ..ros::Quaternion::default() };
-        let error = odometry(odometry_message(quaternion)).unwrap_err();
+        let error = odometry(turned_odometry(quaternion)).unwrap_err();
         assert!(matches!(error, ConvertError::Quaternion { .. }), "{error}");
     }
-    let mut lost = odometry_message(quaternion(0.0));
+    let mut lost = turned_odometry(quaternion(0.0));
     lost.pose.pose.position.y = f64::NAN;
     let error = odometry(lost).unwrap_err();
     assert_eq!(error.to_string(), "the position (1, NaN, 0.1) is not finite");
@@ -192,6 +205,40 @@ proptest! {
     fn no_stamp_panics(nanoseconds in any::<i64>()) {
         let back = stamp(time(Stamp(nanoseconds))).unwrap();
         prop_assert!(back == Stamp(nanoseconds) || back.0.abs() > i64::from(i32::MAX) * NANOSECONDS);
+    }
+
+    #[test]
+    fn odometry_survives_messages(x in -1e3..1e3, y in -1e3..1e3, theta in -PI..PI) {
+        let sample = OdometrySample {
+            stamp: Stamp(7),
+            odom_frame: "odom".to_owned(),
+            base_frame: "base_link".to_owned(),
+            odom_from_base: Pose2::new(x, y, theta),
+        };
+        let back = odometry(odometry_message(&sample)).unwrap();
+        let turn = wrap_angle(back.odom_from_base.theta - theta);
+        prop_assert!(turn.abs() < 1e-14, "{turn}");
+        prop_assert_eq!(back.odom_from_base.position(), sample.odom_from_base.position());
+        let sample = OdometrySample { odom_from_base: back.odom_from_base, ..sample };
+        prop_assert_eq!(back, sample);
+    }
+
+    /// Through the buffer of frames, as in the daemon, the mount is the same bit by bit.
+    #[test]
+    fn mounts_survive_messages(x in -1.0..1.0, y in -1.0..1.0, yaw in -PI..PI, down in any::<bool>()) {
+        let orientation = if down { MountOrientation::UpsideDown } else { MountOrientation::Upright };
+        let mount = LaserMount { base_from_laser: Pose2::new(x, y, yaw), orientation };
+        let message = mount_transform(header(Stamp(0), "base_link"), "laser", &mount);
+        let transform = transform(message).unwrap();
+        let direct = laser_mount(&transform.parent_from_child).unwrap();
+        prop_assert_eq!(direct.orientation, orientation);
+        prop_assert_eq!(direct.base_from_laser.position(), mount.base_from_laser.position());
+        prop_assert!(wrap_angle(direct.base_from_laser.theta - yaw).abs() < 1e-14);
+
+        let mut frames = tf::TfBuffer::new(std::time::Duration::from_secs(1));
+        frames.insert(&transform, tf::Kind::Static).unwrap();
+        let base_from_laser = frames.target_from_source("base_link", "laser", Stamp(5)).unwrap();
+        prop_assert_eq!(laser_mount(&base_from_laser).unwrap(), direct);
     }
 
     #[test]

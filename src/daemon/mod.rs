@@ -4,7 +4,10 @@
 //! [`mailbox`] of the filter's thread ([`mapper`]), which puts it in order ([`synchronizer`]),
 //! runs the filter, and leaves a [`snapshot`] and an entry in the [`ledger`] for each scan.
 
+mod answers;
 pub mod command;
+mod diagnostics;
+pub mod formats;
 pub mod frames;
 pub mod input;
 mod judgement;
@@ -12,6 +15,12 @@ pub mod keys;
 pub mod ledger;
 pub mod mailbox;
 pub mod mapper;
+mod message_clock;
+mod outputs;
+mod queries;
+pub mod save;
+pub mod selector;
+pub mod serving;
 pub mod snapshot;
 pub mod status;
 pub mod synchronizer;
@@ -33,6 +42,7 @@ use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
+use self::serving::{Serving, ServingError};
 use self::snapshot::{Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
@@ -80,6 +90,9 @@ pub enum DaemonError {
     /// The thread `mapper` does not start.
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
+    /// Nothing can be published or answered.
+    #[error(transparent)]
+    Serving(#[from] ServingError),
     /// Zenoh takes no subscriber.
     #[error("cannot subscribe to {key}: {reason}")]
     Subscribe {
@@ -127,6 +140,7 @@ pub struct Daemon {
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
     status: Arc<StatusSource>,
+    serving: Option<Serving>,
     helpers: [JoinHandle<()>; 2],
 }
 
@@ -170,8 +184,15 @@ impl Daemon {
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),
             tokio::spawn(log_changes(Arc::clone(&status))),
         ];
-        // Here serving::start(...) begins: publishers and queryables, which take `snapshots`,
-        // `verdicts`, `commands` and `status`, before anything comes in.
+        let source = Arc::clone(&status);
+        let sources = serving::Sources {
+            snapshots: snapshots.clone(),
+            verdicts: verdicts.subscribe(),
+            commands: commands.clone(),
+            status: serving::StatusSource::new(move || source.status()),
+        };
+        let served = serving::Settings::new(&config, config.raw.save_directory.clone().into());
+        let serving = Some(Serving::start(session, &prefix, served, sources).await?);
         let subscribers = subscribe(session, &keys, &inbox).await?;
         tell_keys(&keys);
         Ok(Self {
@@ -184,6 +205,7 @@ impl Daemon {
             verdicts,
             commands,
             status,
+            serving,
             helpers,
         })
     }
@@ -231,7 +253,9 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
-        // Here the map is saved, if save_on_exit says so, and serving stops.
+        if let Some(serving) = self.serving.take() {
+            tokio::time::timeout(CLOSE, serving.stop()).await.ok();
+        }
         self.snapshots.borrow().clone()
     }
 }

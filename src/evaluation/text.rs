@@ -7,7 +7,11 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use super::{Relation, StampedPose};
+use crate::slam;
 use crate::slam::pose::{Pose2, Stamp};
+
+/// Bytes a line of TUM's format hardly ever exceeds.
+const USUAL_LINE: usize = 100;
 
 /// Why a text file cannot be used.
 #[derive(Debug, Error)]
@@ -55,16 +59,30 @@ pub enum TextError {
 /// Stamps have six decimals: a float of seconds holds no more of today's date.
 #[must_use]
 pub fn tum(trajectory: &[StampedPose]) -> String {
-    let mut text = String::with_capacity(trajectory.len() * 100);
+    let mut text = String::with_capacity(trajectory.len() * USUAL_LINE);
     for StampedPose { stamp, pose } in trajectory {
-        let (sin, cos) = libm::sincos(pose.theta / 2.0);
-        let microseconds = (i128::from(stamp.0) + 500).div_euclid(1000);
-        let (seconds, fraction) =
-            (microseconds.div_euclid(1_000_000), microseconds.rem_euclid(1_000_000));
-        let Pose2 { x, y, .. } = pose;
-        writeln!(text, "{seconds}.{fraction:06} {x:.9} {y:.9} 0 0 0 {sin:.9} {cos:.9}").ok();
+        write_tum_line(&mut text, *stamp, *pose);
     }
     text
+}
+
+/// The path in TUM's format, as [`tum`] writes trajectories.
+#[must_use]
+pub fn tum_of_path(path: &slam::path::Path) -> String {
+    let mut text = String::with_capacity(path.len() * USUAL_LINE);
+    for (stamp, pose_in_map) in path.iter() {
+        write_tum_line(&mut text, stamp, pose_in_map);
+    }
+    text
+}
+
+fn write_tum_line(text: &mut String, stamp: Stamp, pose: Pose2) {
+    let (sin, cos) = libm::sincos(pose.theta / 2.0);
+    let microseconds = (i128::from(stamp.0) + 500).div_euclid(1000);
+    let (seconds, fraction) =
+        (microseconds.div_euclid(1_000_000), microseconds.rem_euclid(1_000_000));
+    let Pose2 { x, y, .. } = pose;
+    writeln!(text, "{seconds}.{fraction:06} {x:.9} {y:.9} 0 0 0 {sin:.9} {cos:.9}").ok();
 }
 
 /// Reads a trajectory: TUM's format, or `stamp x y theta`.

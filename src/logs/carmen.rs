@@ -12,7 +12,7 @@ use std::str::SplitAsciiWhitespace;
 
 use super::lines::{LineError, Lines};
 use super::{LogError, LogStatistics, MalformedLine, Reading};
-use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::pose::{Pose2, Stamp, wrap_angle};
 use crate::slam::scan::{LaserMount, MountOrientation, Scan, ScanGeometry};
 
 /// CARMEN logs name no shortest range. No laser measures less than this, and some write a few
@@ -21,6 +21,9 @@ const RANGE_MIN: f64 = 0.02;
 
 /// How often the largest range of a log must occur to be what the sensor writes without return.
 const NO_RETURN_OCCURRENCES: u64 = 3;
+
+/// Places of the laser that differ by less, m and rad, are one place written with few decimals.
+const MOUNT_ROUNDING: f64 = 0.01;
 
 /// Malformed lines that are kept; all are counted.
 const MALFORMED_KEPT: usize = 100;
@@ -32,7 +35,7 @@ const KEYWORDS_KEPT: usize = 64;
 #[derive(Debug)]
 pub struct CarmenLog {
     path: PathBuf,
-    front_laser: FrontLaser,
+    lasers: Lasers,
     statistics: LogStatistics,
 }
 
@@ -51,7 +54,7 @@ impl CarmenLog {
             line: lines.number(),
             source,
         })?;
-        let (front_laser, statistics) = survey.finish();
+        let (lasers, statistics) = survey.finish();
         if statistics.readings == 0 {
             return Err(LogError::NoReadings {
                 path: path.to_owned(),
@@ -59,7 +62,7 @@ impl CarmenLog {
                 malformed: statistics.malformed,
             });
         }
-        Ok(Self { path: path.to_owned(), front_laser, statistics })
+        Ok(Self { path: path.to_owned(), lasers, statistics })
     }
 
     /// What the survey found.
@@ -75,7 +78,7 @@ impl CarmenLog {
     pub fn readings(&self) -> Result<Readings, LogError> {
         let open = |source| LogError::Open { path: self.path.clone(), source };
         let lines = Lines::open(&self.path).map_err(open)?;
-        Ok(Readings { path: self.path.clone(), lines, front_laser: self.front_laser })
+        Ok(Readings { path: self.path.clone(), lines, lasers: self.lasers })
     }
 }
 
@@ -83,7 +86,7 @@ impl CarmenLog {
 pub struct Readings {
     path: PathBuf,
     lines: Lines,
-    front_laser: FrontLaser,
+    lasers: Lasers,
 }
 
 impl fmt::Debug for Readings {
@@ -102,7 +105,7 @@ impl Iterator for Readings {
                 Ok(None) => return None,
                 Ok(Some(Err(_))) => {}
                 Ok(Some(Ok(line))) => {
-                    if let Ok(Message::Reading(reading)) = parse(line, &self.front_laser) {
+                    if let Ok(Message::Reading(reading)) = parse(line, &self.lasers) {
                         return Some(Ok(Reading { line: number, ..reading }));
                     }
                 }
@@ -115,24 +118,49 @@ impl Iterator for Readings {
     }
 }
 
-/// What an `FLASER` line leaves unsaid.
+/// What one line leaves unsaid and the whole log tells.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct FrontLaser {
+struct Lasers {
+    /// Of `FLASER` lines.
     range_max: f64,
-    base_from_laser: Pose2,
+    /// Of `FLASER` lines.
+    base_from_front_laser: Pose2,
+    /// Of `ROBOTLASER1` lines: the mean of those that are close to the first.
+    base_from_robot_laser: Option<Pose2>,
 }
 
-impl Default for FrontLaser {
+impl Default for Lasers {
     fn default() -> Self {
-        Self { range_max: f64::INFINITY, base_from_laser: Pose2::IDENTITY }
+        Self {
+            range_max: f64::INFINITY,
+            base_from_front_laser: Pose2::IDENTITY,
+            base_from_robot_laser: None,
+        }
     }
+}
+
+impl Lasers {
+    /// Lasers are screwed to their robots: what a line says about the place of one differs from
+    /// the others only by the decimals of the poses it is taken from, or something is moving.
+    fn robot_laser(&self, base_from_laser: Pose2) -> Pose2 {
+        match self.base_from_robot_laser {
+            Some(common) if is_close(common, base_from_laser) => common,
+            _ => base_from_laser,
+        }
+    }
+}
+
+fn is_close(a: Pose2, b: Pose2) -> bool {
+    let difference = a.between(b);
+    difference.position().norm() < MOUNT_ROUNDING && difference.theta.abs() < MOUNT_ROUNDING
 }
 
 /// Gathers what must be known of the whole log.
 #[derive(Debug, Default)]
 struct Survey {
     statistics: LogStatistics,
-    base_from_laser: Pose2,
+    base_from_front_laser: Pose2,
+    robot_laser: MeanPlace,
     range_max_parameter: Option<f64>,
     largest_range: f32,
     largest_range_count: u64,
@@ -146,12 +174,12 @@ impl Survey {
             self.statistics.lines += 1;
             let message = line.and_then(|line| {
                 self.count_keyword(line);
-                parse(line, &FrontLaser::default())
+                parse(line, &Lasers::default())
             });
             match message {
                 Ok(Message::Reading(reading)) => self.add_reading(&reading),
                 Ok(Message::FrontLaserOffset(x)) => {
-                    self.base_from_laser = Pose2::new(x, 0.0, 0.0);
+                    self.base_from_front_laser = Pose2::new(x, 0.0, 0.0);
                 }
                 Ok(Message::FrontLaserMax(range)) => self.range_max_parameter = Some(range),
                 Ok(Message::Other) => {}
@@ -180,7 +208,9 @@ impl Survey {
         let Some(scan) = &reading.scan else { return };
         statistics.scans += 1;
         if scan.geometry.range_max().is_finite() {
-            return; // A ROBOTLASER1 line says its own.
+            // A ROBOTLASER1 line says its own.
+            self.robot_laser.add(reading.mount.base_from_laser);
+            return;
         }
         for &range in scan.ranges.iter().filter(|range| range.is_finite()) {
             if range > self.largest_range {
@@ -197,7 +227,7 @@ impl Survey {
         }
     }
 
-    fn finish(self) -> (FrontLaser, LogStatistics) {
+    fn finish(self) -> (Lasers, LogStatistics) {
         let largest = f64::from(self.largest_range);
         let observed = if self.largest_range_count >= NO_RETURN_OCCURRENCES {
             largest
@@ -207,7 +237,42 @@ impl Survey {
         // A configured maximum may lie above what the sensor writes without return.
         let range_max = self.range_max_parameter.map_or(observed, |range| range.min(observed));
         let range_max = if range_max > RANGE_MIN { range_max } else { f64::INFINITY };
-        (FrontLaser { range_max, base_from_laser: self.base_from_laser }, self.statistics)
+        let lasers = Lasers {
+            range_max,
+            base_from_front_laser: self.base_from_front_laser,
+            base_from_robot_laser: self.robot_laser.mean(),
+        };
+        (lasers, self.statistics)
+    }
+}
+
+/// The mean of the places close to the first.
+#[derive(Debug, Default)]
+struct MeanPlace {
+    first: Option<Pose2>,
+    /// Of the differences from the first.
+    sum: [f64; 3],
+    count: u64,
+}
+
+impl MeanPlace {
+    fn add(&mut self, place: Pose2) {
+        let first = *self.first.get_or_insert(place);
+        if is_close(first, place) {
+            let turn = wrap_angle(place.theta - first.theta);
+            for (sum, difference) in
+                self.sum.iter_mut().zip([place.x - first.x, place.y - first.y, turn])
+            {
+                *sum += difference;
+            }
+            self.count += 1;
+        }
+    }
+
+    fn mean(&self) -> Option<Pose2> {
+        let Pose2 { x, y, theta } = self.first.filter(|_| self.count > 0)?;
+        let [dx, dy, turn] = self.sum.map(|sum| sum / self.count as f64);
+        Some(Pose2::new(x + dx, y + dy, wrap_angle(theta + turn)))
     }
 }
 
@@ -220,11 +285,11 @@ enum Message {
     Other,
 }
 
-fn parse(line: &str, front_laser: &FrontLaser) -> Result<Message, LineError> {
+fn parse(line: &str, lasers: &Lasers) -> Result<Message, LineError> {
     let mut fields = Fields::new(line);
     match fields.next() {
-        "FLASER" => parse_flaser(fields, front_laser).map(Message::Reading),
-        "ROBOTLASER1" => parse_robotlaser(fields).map(Message::Reading),
+        "FLASER" => parse_flaser(fields, lasers).map(Message::Reading),
+        "ROBOTLASER1" => parse_robotlaser(fields, lasers).map(Message::Reading),
         "ODOM" => parse_odom(fields).map(Message::Reading),
         "PARAM" => parse_param(fields),
         _ => Ok(Message::Other),
@@ -232,7 +297,7 @@ fn parse(line: &str, front_laser: &FrontLaser) -> Result<Message, LineError> {
 }
 
 /// `FLASER n r1..rn x y theta odom_x odom_y odom_theta ipc_time host logger_time`
-fn parse_flaser(mut fields: Fields<'_>, front_laser: &FrontLaser) -> Result<Reading, LineError> {
+fn parse_flaser(mut fields: Fields<'_>, lasers: &Lasers) -> Result<Reading, LineError> {
     let beams = fields.beams()?;
     fields.expect(beams.saturating_add(11))?;
     let ranges = fields.ranges(beams)?;
@@ -240,15 +305,15 @@ fn parse_flaser(mut fields: Fields<'_>, front_laser: &FrontLaser) -> Result<Read
     let odom_from_base = fields.pose()?;
     let stamp = fields.stamp()?;
     let increment = sick_increment(beams);
-    let geometry = geometry(-FRAC_PI_2, increment, beams, front_laser.range_max)?;
+    let geometry = geometry(-FRAC_PI_2, increment, beams, lasers.range_max)?;
     let scan = Scan { stamp, geometry, ranges };
-    Ok(scan_reading(scan, odom_from_base, front_laser.base_from_laser))
+    Ok(scan_reading(scan, odom_from_base, lasers.base_from_front_laser))
 }
 
 /// `ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn
 /// n_rem rem.. laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward_safety
 /// side_safety turn_axis ipc_time host logger_time`
-fn parse_robotlaser(mut fields: Fields<'_>) -> Result<Reading, LineError> {
+fn parse_robotlaser(mut fields: Fields<'_>, lasers: &Lasers) -> Result<Reading, LineError> {
     fields.number("laser type")?;
     let start_angle = fields.number("start angle")?;
     let field_of_view = fields.number("field of view")?;
@@ -271,7 +336,8 @@ fn parse_robotlaser(mut fields: Fields<'_>) -> Result<Reading, LineError> {
     let increment = stated_increment(field_of_view, resolution, beams);
     let geometry = geometry(start_angle, increment, beams, range_max)?;
     let scan = Scan { stamp, geometry, ranges };
-    Ok(scan_reading(scan, odom_from_base, odom_from_base.between(odom_from_laser)))
+    let base_from_laser = lasers.robot_laser(odom_from_base.between(odom_from_laser));
+    Ok(scan_reading(scan, odom_from_base, base_from_laser))
 }
 
 /// `ODOM x y theta tv rv accel ipc_time host logger_time`

@@ -9,7 +9,7 @@ mod picture;
 mod text;
 
 pub use hash::content_hash;
-pub use json::json;
+pub use json::{NotAMap, json, parse_json};
 pub use pgm::{pgm, yaml};
 pub use picture::png;
 pub use text::text;

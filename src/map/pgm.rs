@@ -23,12 +23,13 @@ pub fn pgm(grid: &OccupancyGrid) -> Vec<u8> {
     bytes
 }
 
-/// The YAML file that goes with the image; resolution and origin read back as the same floats.
+/// The YAML file that goes with `image`, whatever that is called; resolution and origin read back
+/// as the same floats.
 #[must_use]
 pub fn yaml(grid: &OccupancyGrid, image: &str) -> String {
     let mut text = String::new();
     let origin = grid.origin;
-    writeln!(text, "image: {image}").ok();
+    writeln!(text, "image: {}", scalar(image)).ok();
     writeln!(text, "mode: trinary").ok();
     writeln!(text, "resolution: {}", grid.resolution).ok();
     writeln!(text, "origin: [{}, {}, 0]", origin.x, origin.y).ok();
@@ -36,6 +37,18 @@ pub fn yaml(grid: &OccupancyGrid, image: &str) -> String {
     writeln!(text, "occupied_thresh: {OCCUPIED_THRESHOLD}").ok();
     writeln!(text, "free_thresh: {FREE_THRESHOLD}").ok();
     text
+}
+
+/// A name as YAML takes it: in quotes where a character could mean something else.
+fn scalar(name: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "._-/".contains(c);
+    let begins_plainly = name.starts_with(|c: char| c.is_ascii_alphabetic());
+    if begins_plainly && name.chars().all(plain) {
+        name.to_owned()
+    } else {
+        // A JSON string is a YAML string.
+        serde_json::Value::from(name).to_string()
+    }
 }
 
 const fn grey(cell: i8) -> u8 {
@@ -74,6 +87,17 @@ mod tests {
              origin: [-1.234567890123, 0.1, 0]\nnegate: 0\n\
              occupied_thresh: 0.65\nfree_thresh: 0.196\n"
         );
+    }
+
+    #[test]
+    fn any_name_of_the_image_reads_back() {
+        for name in ["map.pgm", "maps/a-b_c.pgm", "a: b #c.pgm", "- x", "\"q\" 'r'", "1e3", "Küche"]
+        {
+            let text = yaml(&grid(), name);
+            let file: serde_json::Value = serde_saphyr::from_str(&text).unwrap();
+            assert_eq!(file["image"], name);
+        }
+        assert!(yaml(&grid(), "maps/a-b_c.pgm").starts_with("image: maps/a-b_c.pgm\n"));
     }
 
     /// The pixel values decide what nav2 loads: p = (255 - pixel) / 255 against the thresholds.

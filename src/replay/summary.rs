@@ -95,6 +95,8 @@ pub struct Counts {
     pub no_usable_beams: u64,
     /// Readings whose odometry is not finite.
     pub bad_odometry: u64,
+    /// Scans whose angles or limits are lost in a message.
+    pub bad_geometry: u64,
     /// Readings without a scan.
     pub odometry_only: u64,
     /// Readings, whatever became of them, whose odometry step was rejected as a jump.
@@ -111,6 +113,7 @@ impl Counts {
             Verdict::Throttled => &mut self.throttled,
             Verdict::NoUsableBeams => &mut self.no_usable_beams,
             Verdict::BadOdometry => &mut self.bad_odometry,
+            Verdict::BadGeometry => &mut self.bad_geometry,
             Verdict::OdometryOnly => &mut self.odometry_only,
         };
         *count += 1;
@@ -239,4 +242,7 @@ pub struct Hashes {
     /// Of `trajectory.tum`.
     #[serde(rename = "trajectory.tum")]
     pub trajectory: String,
+    /// Of the poses at processed scans, as the daemon answers `path?format=tum`.
+    #[serde(rename = "path.tum")]
+    pub path: String,
 }

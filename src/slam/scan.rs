@@ -96,6 +96,12 @@ impl ScanGeometry {
         self.angle_increment
     }
 
+    /// Shortest range the sensor measures, m.
+    #[must_use]
+    pub const fn range_min(&self) -> f64 {
+        self.range_min
+    }
+
     /// Longest range the sensor measures, m; may be infinite.
     #[must_use]
     pub const fn range_max(&self) -> f64 {

@@ -3,7 +3,7 @@ use proptest::prelude::{any, prop_assert_eq, proptest};
 use super::*;
 use crate::slam::scan::Beam;
 
-fn survey(log: &str) -> (FrontLaser, LogStatistics) {
+fn survey(log: &str) -> (Lasers, LogStatistics) {
     let bytes: Vec<u8> = log.as_bytes().to_vec();
     let mut survey = Survey::default();
     survey.read(&mut Lines::new(Box::new(std::io::Cursor::new(bytes)))).unwrap();
@@ -11,7 +11,7 @@ fn survey(log: &str) -> (FrontLaser, LogStatistics) {
 }
 
 fn reading(line: &str) -> Reading {
-    match parse(line, &FrontLaser::default()).unwrap() {
+    match parse(line, &Lasers::default()).unwrap() {
         Message::Reading(reading) => reading,
         other => panic!("{line} is {other:?}"),
     }
@@ -62,6 +62,25 @@ fn a_robotlaser_line_gives_the_mount_of_its_laser() {
     assert_eq!(beams, [Beam::Hit(1.0), Beam::NoReturn, Beam::Invalid]);
 }
 
+/// Written with few decimals, the place of a laser differs from line to line.
+#[test]
+fn a_laser_that_is_screwed_to_its_robot_has_one_place() {
+    let line = |laser: &str| {
+        let header = "0 -1.570796 3.141593 1.570796 80.0 0.01 0 3 1 81 0";
+        robotlaser(header, &format!("{laser} 1.0 2.0 0.0"))
+    };
+    let log = [line("1.145 2 0"), line("1.147 2 0.002"), line("4.0 2 0"), line("1.146 2 -0.002")];
+    let (lasers, _) = survey(&(log.join("\n") + "\n"));
+    let mount = |line: &str| match parse(line, &lasers).unwrap() {
+        Message::Reading(reading) => reading.mount.base_from_laser,
+        other => panic!("{line} is {other:?}"),
+    };
+    let common = mount(&log[0]);
+    assert!((common.x - 0.146).abs() < 1e-12 && common.theta.abs() < 1e-12, "{common:?}");
+    assert_eq!([mount(&log[1]), mount(&log[3])], [common; 2]);
+    assert_eq!(mount(&log[2]).x, 3.0);
+}
+
 #[test]
 fn remissions_are_passed_over() {
     let line = "ROBOTLASER1 0 0 1 0.5 80 0.01 0 3 1 2 3 2 0.5 0.5 0 0 0 0 0 0 0 0 0 0 0 7.5 h 7.6";
@@ -94,9 +113,9 @@ fn parameters_of_the_front_laser_are_used() {
         "PARAM robot_front_laser_max 50.0\nPARAM robot_frontlaser_offset 0.3 host 0\n{}\n",
         flaser(4, "81.83")
     );
-    let (front_laser, _) = survey(&log);
-    assert_eq!(front_laser.range_max, 50.0);
-    assert_eq!(front_laser.base_from_laser, Pose2::new(0.3, 0.0, 0.0));
+    let (lasers, _) = survey(&log);
+    assert_eq!(lasers.range_max, 50.0);
+    assert_eq!(lasers.base_from_front_laser, Pose2::new(0.3, 0.0, 0.0));
 }
 
 /// A driver may be configured for 81.9 m and write 81.83 m where nothing reflected.

@@ -1,0 +1,176 @@
+//! Asking robots on the mesh.
+
+use std::future::Future;
+use std::time::Duration;
+
+use anyhow::{Context as _, anyhow, bail};
+use gmapd::daemon::keys::Prefix;
+use zenoh::Session;
+use zenoh::bytes::ZBytes;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+
+/// A daemon answers from memory; this is for the network.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// The key of every daemon's liveliness token.
+const ALIVE: &str = "slam/alive";
+
+/// Runs what needs a session, on the runtime that Zenoh needs.
+pub(super) fn block_on<T>(work: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("client")
+        .enable_all()
+        .build()
+        .context("cannot start threads")?
+        .block_on(work)
+}
+
+/// What a robot answered.
+#[derive(Debug)]
+pub(super) struct Answer {
+    pub(super) bytes: Vec<u8>,
+    /// As Zenoh tells it.
+    pub(super) encoding: String,
+}
+
+/// Asks for a key, with parameters behind a question mark; `None` if nobody answers.
+///
+/// An answer that says what is wrong is an error with these words.
+pub(super) async fn ask(session: &Session, selector: &str) -> anyhow::Result<Option<Answer>> {
+    let replies = session.get(selector).timeout(PATIENCE).await;
+    let replies = replies.map_err(|error| anyhow!(error)).context("cannot ask")?;
+    while let Ok(reply) = replies.recv_async().await {
+        match reply.result() {
+            Ok(sample) => {
+                let encoding = sample.encoding().to_string();
+                return Ok(Some(Answer { bytes: owned(sample.payload()), encoding }));
+            }
+            // Nobody's words, but those of the session that stopped waiting.
+            Err(error) if error.payload().try_to_string().is_ok_and(|text| text == "Timeout") => {}
+            Err(error) => bail!("{}", String::from_utf8_lossy(&error.payload().to_bytes())),
+        }
+    }
+    Ok(None)
+}
+
+/// Asks for a key of a robot; nobody answering is an error that tells who would.
+pub(super) async fn ask_robot(
+    session: &Session,
+    robot: &Prefix,
+    (name, parameters): (&str, &str),
+) -> anyhow::Result<Answer> {
+    let key = robot.key(name)?;
+    let selector =
+        if parameters.is_empty() { key.to_string() } else { format!("{key}?{parameters}") };
+    match ask(session, &selector).await? {
+        Some(answer) => Ok(answer),
+        None => bail!("nobody answers on {key}; {}", remedy(&alive(session).await?)),
+    }
+}
+
+/// The answers of all robots to a key, with the robots that gave them; errors are passed over.
+pub(super) async fn ask_all(
+    session: &Session,
+    name: &str,
+) -> anyhow::Result<Vec<(Prefix, Answer)>> {
+    let replies = session
+        .get(format!("**/{name}"))
+        .target(QueryTarget::All)
+        .consolidation(ConsolidationMode::None)
+        .timeout(PATIENCE)
+        .await
+        .map_err(|error| anyhow!(error))
+        .context("cannot ask")?;
+    let mut answers = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let Ok(sample) = reply.result() else { continue };
+        if let Some(robot) = robot_of(sample.key_expr().as_str(), name) {
+            let encoding = sample.encoding().to_string();
+            answers.push((robot, Answer { bytes: owned(sample.payload()), encoding }));
+        }
+    }
+    Ok(answers)
+}
+
+/// The robots whose daemons are alive, in the order of their names.
+pub(super) async fn alive(session: &Session) -> anyhow::Result<Vec<Prefix>> {
+    let replies = session.liveliness().get(format!("**/{ALIVE}")).timeout(PATIENCE).await;
+    let replies = replies.map_err(|error| anyhow!(error)).context("cannot ask who is alive")?;
+    let mut robots = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let key = reply.result().map(|sample| sample.key_expr().to_string());
+        robots.extend(key.ok().and_then(|key| robot_of(&key, ALIVE)));
+    }
+    robots.sort_by_key(Prefix::to_string);
+    robots.dedup();
+    Ok(robots)
+}
+
+/// The robot that was named, or the only one that is alive.
+pub(super) async fn choose(session: &Session, named: Option<&str>) -> anyhow::Result<Prefix> {
+    if let Some(name) = named {
+        return Ok(Prefix::parse(name)?);
+    }
+    let mut robots = alive(session).await?;
+    match (robots.pop(), robots.len()) {
+        (Some(robot), 0) => Ok(robot),
+        (None, _) => bail!("no robot is named, and {}", remedy(&[])),
+        (Some(last), _) => {
+            robots.push(last);
+            bail!("several robots are alive: {}; name one of them", names(&robots))
+        }
+    }
+}
+
+/// A robot's name for people.
+pub(super) fn name(robot: &Prefix) -> String {
+    let name = robot.to_string();
+    if name.is_empty() { "\"\"".to_owned() } else { name }
+}
+
+fn names(robots: &[Prefix]) -> String {
+    robots.iter().map(name).collect::<Vec<_>>().join(", ")
+}
+
+fn remedy(alive: &[Prefix]) -> String {
+    if alive.is_empty() {
+        "no gmapd is alive on this mesh: start gmapd run, or name the way to it with \
+         -e tcp/HOST:PORT"
+            .to_owned()
+    } else {
+        format!("alive are: {}", names(alive))
+    }
+}
+
+/// The robot whose key ends with `name`.
+fn robot_of(key: &str, name: &str) -> Option<Prefix> {
+    let prefix = key.strip_suffix(name)?;
+    let is_whole = prefix.is_empty() || prefix.ends_with('/');
+    Prefix::parse(prefix).ok().filter(|_| is_whole)
+}
+
+fn owned(payload: &ZBytes) -> Vec<u8> {
+    payload.to_bytes().into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_tells_whose_it_is() {
+        let robot = |key| robot_of(key, ALIVE).map(|robot| robot.to_string());
+        assert_eq!(robot("robot01/slam/alive").as_deref(), Some("robot01"));
+        assert_eq!(robot("site/a/slam/alive").as_deref(), Some("site/a"));
+        assert_eq!(robot("slam/alive").as_deref(), Some(""));
+        assert_eq!(robot("robot01/islam/alive"), None);
+        assert_eq!(robot("robot01/slam/status"), None);
+    }
+
+    #[test]
+    fn who_has_no_name_is_shown_as_it_is_typed() {
+        let robots = ["", "robot01"].map(|name| Prefix::parse(name).unwrap());
+        assert_eq!(names(&robots), "\"\", robot01");
+    }
+}

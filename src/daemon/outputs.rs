@@ -1,0 +1,394 @@
+//! What the daemon publishes without being asked.
+//!
+//! Each output is a task that watches the snapshot. A put may block while the network is slow, so
+//! large ones are encoded and put on threads for blocking work; small ones are dropped instead.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use tokio::sync::{broadcast, watch};
+use tokio::task::{JoinSet, spawn_blocking};
+use tokio::time::MissedTickBehavior;
+use zenoh::bytes::Encoding;
+use zenoh::key_expr::OwnedKeyExpr;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::{Session, Wait as _};
+use zenoh_ext::{
+    AdvancedPublisher, AdvancedPublisherBuilderExt as _, CacheConfig, MissDetectionConfig,
+};
+
+use super::answers::{cdr_of, particle_cloud, pose_message};
+use super::diagnostics::diagnostics;
+use super::formats::{MapProducts, ProductCache};
+use super::keys::Prefix;
+use super::ledger::Entry;
+use super::message_clock::MessageClock;
+use super::selector::{MessageFormat, PathFormat};
+use super::serving::{AskStatus, ServingError, Settings};
+use super::snapshot::Snapshot;
+use crate::clock::Stopwatch;
+use crate::convert;
+use crate::ros;
+use crate::slam::pose::Pose2;
+
+/// How soon a subscriber that missed the last map hears that there is one.
+const HEARTBEAT: Duration = Duration::from_millis(500);
+
+const DIAGNOSTICS_PERIOD: Duration = Duration::from_secs(1);
+
+type Snapshots = watch::Receiver<Arc<Snapshot>>;
+
+/// Declares publishers and starts the tasks that use them.
+pub(super) struct Declare<'a> {
+    pub(super) session: &'a Session,
+    pub(super) prefix: &'a Prefix,
+}
+
+impl Declare<'_> {
+    /// `map`, `map_metadata` and `path`, which change with the version of the map.
+    pub(super) async fn maps(
+        &self,
+        settings: &Settings,
+        snapshots: &Snapshots,
+        products: &Arc<ProductCache>,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        for kind in [Retained::Map, Retained::Metadata, Retained::Path] {
+            let output = RetainedOutput {
+                kind,
+                publisher: Arc::new(self.retaining(kind).await?),
+                products: products.clone(),
+                interval: settings.map_update_interval,
+            };
+            tasks.spawn(output.run(snapshots.clone()));
+        }
+        Ok(())
+    }
+
+    /// `pose`, `entropy` and `particlecloud`.
+    pub(super) async fn estimates(
+        &self,
+        settings: &Settings,
+        snapshots: &Snapshots,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let outputs = EstimateOutputs {
+            pose: self.prompt("pose", cdr_of::<ros::PoseWithCovarianceStamped>()).await?,
+            entropy: self.plain("entropy", cdr_of::<ros::Float64>()).await?,
+            particles: self.plain("particlecloud", cdr_of::<ros::PoseArray>()).await?,
+            map_frame: settings.map_frame.clone(),
+            period: settings.transform_publish_period,
+        };
+        tasks.spawn(outputs.run(snapshots.clone()));
+        Ok(())
+    }
+
+    /// `tf`, unless it is switched off.
+    pub(super) async fn transform(
+        &self,
+        settings: Settings,
+        snapshots: Snapshots,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        if !settings.transform_publish_period.is_zero() {
+            let publisher = self.prompt("tf", cdr_of::<ros::TfMessage>()).await?;
+            tasks.spawn(publish_transform(publisher, settings, snapshots));
+        }
+        Ok(())
+    }
+
+    /// `diagnostics`.
+    pub(super) async fn diagnostics(
+        &self,
+        status: AskStatus,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let publisher = self.plain("diagnostics", cdr_of::<ros::DiagnosticArray>()).await?;
+        tasks.spawn(publish_diagnostics(publisher, self.prefix.to_string(), status));
+        Ok(())
+    }
+
+    /// `slam/verdict`.
+    pub(super) async fn verdicts(
+        &self,
+        verdicts: broadcast::Receiver<Entry>,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let key = self.prefix.key("slam/verdict")?;
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .encoding(Encoding::APPLICATION_JSON)
+            // Who feeds a log at full speed waits for the newest, so it must arrive.
+            .congestion_control(CongestionControl::Block)
+            .await;
+        tasks.spawn(publish_verdicts(declared(key, publisher)?, verdicts));
+        Ok(())
+    }
+
+    /// A publisher of small messages; of those that do not fit, the newest is dropped.
+    async fn plain(
+        &self,
+        name: &str,
+        encoding: Encoding,
+    ) -> Result<Publisher<'static>, ServingError> {
+        let key = self.prefix.key(name)?;
+        let publisher = self.session.declare_publisher(key.clone()).encoding(encoding);
+        declared(key, publisher.congestion_control(CongestionControl::Drop).await)
+    }
+
+    /// As [`Self::plain`], for messages that are of use at once or never.
+    async fn prompt(
+        &self,
+        name: &str,
+        encoding: Encoding,
+    ) -> Result<Publisher<'static>, ServingError> {
+        let key = self.prefix.key(name)?;
+        let publisher = self.session.declare_publisher(key.clone()).encoding(encoding);
+        let publisher = publisher.congestion_control(CongestionControl::Drop).express(true);
+        declared(key, publisher.priority(Priority::InteractiveHigh).await)
+    }
+
+    /// A publisher whose last sample is kept for who comes later, as ROS' transient local is.
+    async fn retaining(&self, kind: Retained) -> Result<AdvancedPublisher<'static>, ServingError> {
+        let key = self.prefix.key(kind.name())?;
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .encoding(kind.encoding())
+            // A map goes out in pieces. Those that may be dropped are, and then none of it arrives;
+            // this one waits for its place, and only the next is dropped meanwhile.
+            .congestion_control(CongestionControl::BlockFirst)
+            .priority(Priority::DataLow)
+            .cache(CacheConfig::default().max_samples(1))
+            .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
+            .publisher_detection()
+            .await;
+        declared(key, publisher)
+    }
+}
+
+fn declared<P>(key: OwnedKeyExpr, publisher: Result<P, zenoh::Error>) -> Result<P, ServingError> {
+    publisher.map_err(|source| ServingError::Declare { key, source })
+}
+
+/// What is kept for subscribers that come later.
+#[derive(Debug, Clone, Copy)]
+enum Retained {
+    Map,
+    Metadata,
+    Path,
+}
+
+impl Retained {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Map => "map",
+            Self::Metadata => "map_metadata",
+            Self::Path => "path",
+        }
+    }
+
+    fn encoding(self) -> Encoding {
+        match self {
+            Self::Map => cdr_of::<ros::OccupancyGrid>(),
+            Self::Metadata => cdr_of::<ros::MapMetaData>(),
+            Self::Path => cdr_of::<ros::Path>(),
+        }
+    }
+
+    fn encode(self, products: &MapProducts) -> Bytes {
+        match self {
+            Self::Map => products.cdr(),
+            Self::Metadata => ros::cdr(&products.metadata()).into(),
+            Self::Path => products.path_in(PathFormat::Message(MessageFormat::Cdr)),
+        }
+    }
+
+    /// What is the same as long as nothing new is to be told.
+    fn content(self, products: &MapProducts) -> String {
+        match self {
+            Self::Map | Self::Metadata => products.label().sha256.clone(),
+            Self::Path => products.version().to_string(),
+        }
+    }
+}
+
+/// Publishes one product of the map when it has changed and somebody takes it.
+///
+/// Nothing is encoded for nobody. A subscriber that comes when there was none, late or first ever,
+/// makes the publisher match, and then the newest is put: it receives that, or finds it in the
+/// cache. From then on the cache is up to date for those that come after it.
+struct RetainedOutput {
+    kind: Retained,
+    publisher: Arc<AdvancedPublisher<'static>>,
+    products: Arc<ProductCache>,
+    interval: Duration,
+}
+
+impl RetainedOutput {
+    async fn run(self, mut snapshots: Snapshots) {
+        let Ok(matching) = self.publisher.matching_listener().await else { return };
+        let mut content = None;
+        let mut version = 0;
+        let mut resting = false;
+        let rest = tokio::time::sleep(Duration::ZERO);
+        tokio::pin!(rest);
+        loop {
+            tokio::select! {
+                changed = snapshots.changed() => if changed.is_err() { return },
+                matched = matching.recv_async() => match matched {
+                    // Who has just come does not wait for the next map.
+                    Ok(_) => resting = false,
+                    Err(_) => return,
+                },
+                () = &mut rest, if resting => resting = false,
+            }
+            let snapshot = snapshots.borrow_and_update().clone();
+            let Some(newest) = &snapshot.map else { continue };
+            if resting || newest.version == version || !self.is_wanted().await {
+                continue;
+            }
+            version = newest.version;
+            let products = self.products.of(Some(newest));
+            content = self.put(products, content).await;
+            resting = true;
+            rest.set(tokio::time::sleep(self.interval));
+        }
+    }
+
+    async fn is_wanted(&self) -> bool {
+        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+    }
+
+    /// Puts a version whose content is not `last`; returns the content that was put last.
+    async fn put(&self, products: Arc<MapProducts>, last: Option<String>) -> Option<String> {
+        let (kind, publisher) = (self.kind, self.publisher.clone());
+        let put = move || {
+            let content = kind.content(&products);
+            if last.as_ref() != Some(&content) {
+                tell(kind.name(), publisher.put(kind.encode(&products)).wait());
+            }
+            Some(content)
+        };
+        spawn_blocking(put).await.ok().flatten()
+    }
+}
+
+/// Publishes where the robot is, and what the particles think.
+struct EstimateOutputs {
+    pose: Publisher<'static>,
+    entropy: Publisher<'static>,
+    particles: Publisher<'static>,
+    map_frame: String,
+    /// Between two publications at least.
+    period: Duration,
+}
+
+impl EstimateOutputs {
+    async fn run(self, mut snapshots: Snapshots) {
+        let mut last = None;
+        let mut particles: Arc<[Pose2]> = Arc::new([]);
+        snapshots.mark_changed();
+        while snapshots.changed().await.is_ok() {
+            let snapshot = snapshots.borrow_and_update().clone();
+            let estimate = &snapshot.estimate;
+            let now = (estimate.stamp, estimate.pose_in_map);
+            let is_new = last.replace(now) != Some(now);
+            if is_new && let Some(pose) = pose_message(estimate, &self.map_frame) {
+                tell("pose", self.pose.put(ros::cdr(&pose)).await);
+            }
+            // With every processed scan the particles are other ones.
+            if !Arc::ptr_eq(&particles, &estimate.particles) && !estimate.particles.is_empty() {
+                particles = estimate.particles.clone();
+                self.put_particles(&snapshot).await;
+            }
+            if is_new {
+                tokio::time::sleep(self.period).await;
+            }
+        }
+    }
+
+    async fn put_particles(&self, snapshot: &Snapshot) {
+        let estimate = &snapshot.estimate;
+        if let Some(report) = &estimate.report {
+            let entropy = ros::Float64 { data: report.entropy };
+            tell("entropy", self.entropy.put(ros::cdr(&entropy)).await);
+        }
+        if self.particles.matching_status().await.is_ok_and(|status| status.matching()) {
+            let cloud = particle_cloud(estimate, &self.map_frame);
+            tell("particlecloud", self.particles.put(ros::cdr(&cloud)).await);
+        }
+    }
+}
+
+/// Sends map to odom in steady steps, whether or not scans come: odometry goes on without them.
+async fn publish_transform(
+    publisher: Publisher<'static>,
+    settings: Settings,
+    mut snapshots: Snapshots,
+) {
+    let ahead_ns = (settings.tf_delay_s * 1e9) as i64;
+    let running = Stopwatch::start();
+    let mut clock = MessageClock::default();
+    let mut ticks = tokio::time::interval(settings.transform_publish_period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    snapshots.mark_changed();
+    loop {
+        tokio::select! {
+            changed = snapshots.changed() => {
+                if changed.is_err() {
+                    return;
+                }
+                if let Some(stamp) = snapshots.borrow_and_update().estimate.stamp {
+                    clock.hear(stamp, running.elapsed().wall);
+                }
+            }
+            _ = ticks.tick() => {
+                let Some(stamp) = clock.tell(running.elapsed().wall, ahead_ns) else { continue };
+                let map_from_odom = snapshots.borrow().estimate.map_from_odom;
+                let header = convert::header(stamp, &settings.map_frame);
+                let transform =
+                    convert::transform_stamped(header, &settings.odom_frame, map_from_odom);
+                let message = ros::TfMessage { transforms: vec![transform] };
+                tell("tf", publisher.put(ros::cdr(&message)).await);
+            }
+        }
+    }
+}
+
+async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: AskStatus) {
+    let mut ticks = tokio::time::interval(DIAGNOSTICS_PERIOD);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    loop {
+        ticks.tick().await;
+        let message = diagnostics(&status.status(), &robot);
+        tell("diagnostics", publisher.put(ros::cdr(&message)).await);
+    }
+}
+
+/// Zenoh drops what nobody subscribes to, before it is sent.
+async fn publish_verdicts(publisher: Publisher<'static>, mut verdicts: broadcast::Receiver<Entry>) {
+    let publisher = Arc::new(publisher);
+    loop {
+        let entry = match verdicts.recv().await {
+            Ok(entry) => entry,
+            // The oldest were overwritten; those that are left, up to the newest, are sent.
+            Err(broadcast::error::RecvError::Lagged(_)) => continue,
+            Err(broadcast::error::RecvError::Closed) => return,
+        };
+        let json = serde_json::to_vec(&entry).expect("memory takes every write");
+        let publisher = publisher.clone();
+        let put = spawn_blocking(move || tell("slam/verdict", publisher.put(json).wait()));
+        put.await.ok();
+    }
+}
+
+/// What is lost here is lost with the session, which says so itself.
+fn tell(output: &str, put: Result<(), zenoh::Error>) {
+    if let Err(error) = put {
+        tracing::debug!(output, %error, "not published");
+    }
+}

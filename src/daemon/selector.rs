@@ -1,0 +1,622 @@
+//! What a query asks: its key and its parameters, parsed once.
+//!
+//! Parameters are `name=value`, with `;` between them, as in `map?format=text;cols=100`. Those
+//! that begin with `_` are Zenoh's own and passed over.
+
+use std::f64::consts::TAU;
+use std::num::NonZeroUsize;
+
+use thiserror::Error;
+
+use super::save::{NameError, SaveName};
+use crate::slam::pose::{Pose2, Stamp, wrap_angle};
+
+/// Columns of a map drawn with characters, unless asked otherwise.
+const USUAL_COLUMNS: NonZeroUsize = NonZeroUsize::new(80).expect("80 is not 0");
+
+/// A terminal is not wider, and a reply not larger than it is worth.
+const MOST_COLUMNS: usize = 1000;
+
+/// Coordinates that are further away than this are typing errors, m.
+const FURTHEST: f64 = 1e6;
+
+/// Characters of a query that an error repeats.
+const LONGEST_EXCERPT: usize = 60;
+
+const NANOSECOND_DIGITS: usize = 9;
+
+/// What a robot can be asked, one key each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Topic {
+    /// The map.
+    Map,
+    /// The map, as the service of slam_gmapping.
+    DynamicMap,
+    /// Size and place of the map.
+    MapMetadata,
+    /// Where the robot is, or was.
+    Pose,
+    /// The way of the robot.
+    Path,
+    /// The poses of the particles.
+    ParticleCloud,
+    /// How undecided the particles are.
+    Entropy,
+    /// How the daemon is.
+    Status,
+    /// Begin anew.
+    Reset,
+    /// Take no scans.
+    Pause,
+    /// Take scans again.
+    Resume,
+    /// Say where the robot is.
+    InitialPose,
+    /// Write the map to files.
+    Save,
+}
+
+impl Topic {
+    /// All that can be asked.
+    pub const ALL: [Self; 13] = [
+        Self::Map,
+        Self::DynamicMap,
+        Self::MapMetadata,
+        Self::Pose,
+        Self::Path,
+        Self::ParticleCloud,
+        Self::Entropy,
+        Self::Status,
+        Self::Reset,
+        Self::Pause,
+        Self::Resume,
+        Self::InitialPose,
+        Self::Save,
+    ];
+
+    /// The key under the robot's prefix.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Map => "map",
+            Self::DynamicMap => "dynamic_map",
+            Self::MapMetadata => "map_metadata",
+            Self::Pose => "pose",
+            Self::Path => "path",
+            Self::ParticleCloud => "particlecloud",
+            Self::Entropy => "entropy",
+            Self::Status => "slam/status",
+            Self::Reset => "slam/cmd/reset",
+            Self::Pause => "slam/cmd/pause",
+            Self::Resume => "slam/cmd/resume",
+            Self::InitialPose => "slam/cmd/initial_pose",
+            Self::Save => "slam/cmd/save",
+        }
+    }
+
+    /// Whether asking changes something, so that it must not happen by a wildcard.
+    #[must_use]
+    pub const fn is_command(self) -> bool {
+        matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::InitialPose | Self::Save)
+    }
+
+    /// What is asked with these parameters.
+    ///
+    /// # Errors
+    /// When a parameter is not known here, is there twice, or has a value that is not allowed.
+    pub fn question(self, parameters: &str) -> Result<Question, SelectorError> {
+        let of = |allowed| Parameters::parse(parameters, allowed);
+        Ok(match self {
+            Self::Map => Question::Map(map_format(&of(&["format", "cols"])?)?),
+            // Never an error: a ROS client of this service would wait for a reply for ever.
+            Self::DynamicMap => Question::DynamicMap,
+            Self::MapMetadata => Question::MapMetadata(of(&["format"])?.message_format()?),
+            Self::Pose => {
+                let parameters = of(&["format", "at"])?;
+                let format = parameters.message_format()?;
+                Question::Pose { at: parameters.get("at").map(stamp).transpose()?, format }
+            }
+            Self::Path => Question::Path(path_format(&of(&["format"])?)?),
+            Self::ParticleCloud => Question::ParticleCloud(of(&["format"])?.message_format()?),
+            Self::Entropy => Question::Entropy(of(&["format"])?.message_format()?),
+            Self::Status => {
+                of(&["format"])?.choice("format", &[("json", ())])?;
+                Question::Status
+            }
+            Self::Reset => Question::Reset(of(&["x", "y", "yaw"])?.pose()?),
+            Self::Pause => of(&[]).map(|_| Question::Pause)?,
+            Self::Resume => of(&[]).map(|_| Question::Resume)?,
+            Self::InitialPose => {
+                let pose = of(&["x", "y", "yaw"])?.pose()?;
+                Question::InitialPose(pose.ok_or(SelectorError::NoPose)?)
+            }
+            Self::Save => {
+                let parameters = of(&["name"])?;
+                let name = parameters.get("name").map(SaveName::parse).transpose()?;
+                Question::Save(name.unwrap_or_default())
+            }
+        })
+    }
+}
+
+/// A query that makes sense.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Question {
+    /// The map, in this format.
+    Map(MapFormat),
+    /// The map as the response of `nav_msgs/srv/GetMap`.
+    DynamicMap,
+    /// `nav_msgs/MapMetaData`.
+    MapMetadata(MessageFormat),
+    /// `geometry_msgs/PoseWithCovarianceStamped`.
+    Pose {
+        /// When; `None` for now.
+        at: Option<Stamp>,
+        /// How to write it.
+        format: MessageFormat,
+    },
+    /// The way of the robot.
+    Path(PathFormat),
+    /// `geometry_msgs/PoseArray`.
+    ParticleCloud(MessageFormat),
+    /// `std_msgs/Float64`.
+    Entropy(MessageFormat),
+    /// How the daemon is.
+    Status,
+    /// Begin anew, with the base at this pose in `map` if there is one.
+    Reset(Option<Pose2>),
+    /// Take no scans.
+    Pause,
+    /// Take scans again.
+    Resume,
+    /// The base is at this pose in `map`.
+    InitialPose(Pose2),
+    /// Write the map to files of this name.
+    Save(SaveName),
+}
+
+/// The ways to write the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum MapFormat {
+    /// `nav_msgs/OccupancyGrid` as CDR.
+    Cdr,
+    /// Cells in runs of equal ones.
+    Json,
+    /// A picture with the path.
+    Png,
+    /// The image of map_server.
+    Pgm,
+    /// The file that goes with the image of map_server.
+    Yaml,
+    /// Drawn with characters.
+    Text {
+        /// Characters a line at most.
+        columns: NonZeroUsize,
+    },
+}
+
+/// The ways to write a ROS message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum MessageFormat {
+    /// CDR.
+    Cdr,
+    /// JSON of the same fields.
+    Json,
+}
+
+/// The ways to write the path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PathFormat {
+    /// `nav_msgs/Path`.
+    Message(MessageFormat),
+    /// A line a pose: stamp, position, quaternion.
+    Tum,
+}
+
+/// Why a query makes no sense.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum SelectorError {
+    /// A parameter that is not known here.
+    #[error("there is no parameter {name:?} here; {}", allowed_names(allowed))]
+    Unknown {
+        /// As it was given.
+        name: String,
+        /// What there is.
+        allowed: &'static [&'static str],
+    },
+    /// The same parameter once more.
+    #[error("the parameter {0} is given twice; give it once")]
+    Twice(&'static str),
+    /// A word that is not one of those allowed.
+    #[error("{name}={value:?} is not known; allowed are {}", allowed.join(", "))]
+    NoChoice {
+        /// The parameter.
+        name: &'static str,
+        /// As it was given.
+        value: String,
+        /// The words that are.
+        allowed: Vec<&'static str>,
+    },
+    /// A value that is not a number, or not one that is allowed.
+    #[error("{name}={value:?} is not allowed; it must be {allowed}")]
+    NoNumber {
+        /// The parameter.
+        name: &'static str,
+        /// As it was given.
+        value: String,
+        /// What it may be.
+        allowed: &'static str,
+    },
+    /// A width for a format that has none.
+    #[error("cols is only for format=text; leave it out, or ask for format=text")]
+    ColumnsWithoutText,
+    /// A pose without some of its parts.
+    #[error("{0} is missing: a pose needs x and y in metres and yaw in radians")]
+    PartOfPose(&'static str),
+    /// No pose where one is needed.
+    #[error("a pose is needed: x and y in metres and yaw in radians, as in x=1.5;y=-2;yaw=0.5")]
+    NoPose,
+    /// No name for files.
+    #[error(transparent)]
+    Name(#[from] NameError),
+}
+
+fn allowed_names(allowed: &[&str]) -> String {
+    if allowed.is_empty() {
+        "none is allowed".to_owned()
+    } else {
+        format!("allowed are {}", allowed.join(", "))
+    }
+}
+
+/// The beginning of what somebody sent: an error reply does not grow with the query.
+pub(super) fn excerpt(text: &str) -> String {
+    let mut characters = text.chars();
+    let mut excerpt: String = characters.by_ref().take(LONGEST_EXCERPT).collect();
+    if characters.next().is_some() {
+        excerpt.push('…');
+    }
+    excerpt
+}
+
+/// The parameters of a query: each is known and there once.
+struct Parameters<'a>(Vec<(&'static str, &'a str)>);
+
+impl<'a> Parameters<'a> {
+    fn parse(text: &'a str, allowed: &'static [&'static str]) -> Result<Self, SelectorError> {
+        let mut parameters = Self(Vec::new());
+        let parts = text.split(';').filter(|part| !part.is_empty() && !part.starts_with('_'));
+        for part in parts {
+            let (name, value) = part.split_once('=').unwrap_or((part, ""));
+            let Some(&known) = allowed.iter().find(|&&known| known == name) else {
+                return Err(SelectorError::Unknown { name: excerpt(name), allowed });
+            };
+            if parameters.get(known).is_some() {
+                return Err(SelectorError::Twice(known));
+            }
+            parameters.0.push((known, value));
+        }
+        Ok(parameters)
+    }
+
+    fn get(&self, name: &str) -> Option<&'a str> {
+        self.0.iter().find(|(known, _)| *known == name).map(|&(_, value)| value)
+    }
+
+    /// What a word stands for; `None` if it is not given.
+    fn choice<T: Copy>(
+        &self,
+        name: &'static str,
+        choices: &[(&'static str, T)],
+    ) -> Result<Option<T>, SelectorError> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        let chosen = choices.iter().find(|(word, _)| *word == value);
+        chosen.map(|&(_, choice)| Some(choice)).ok_or_else(|| SelectorError::NoChoice {
+            name,
+            value: excerpt(value),
+            allowed: choices.iter().map(|&(word, _)| word).collect(),
+        })
+    }
+
+    fn message_format(&self) -> Result<MessageFormat, SelectorError> {
+        let choices = [("json", MessageFormat::Json), ("cdr", MessageFormat::Cdr)];
+        Ok(self.choice("format", &choices)?.unwrap_or(MessageFormat::Json))
+    }
+
+    /// All parts of a pose, or none.
+    fn pose(&self) -> Result<Option<Pose2>, SelectorError> {
+        if self.0.is_empty() {
+            return Ok(None);
+        }
+        let part = |name| self.get(name).ok_or(SelectorError::PartOfPose(name));
+        let (x, y, yaw) = (part("x")?, part("y")?, part("yaw")?);
+        let metres = |name, value| {
+            number(name, value, FURTHEST, "a number of metres from -1000000 to 1000000")
+        };
+        let yaw = number("yaw", yaw, TAU, "a number of radians from -6.283 to 6.283")?;
+        Ok(Some(Pose2::new(metres("x", x)?, metres("y", y)?, wrap_angle(yaw))))
+    }
+}
+
+/// A number between `-most` and `most`; a degree taken for a radian is mostly beyond.
+fn number(
+    name: &'static str,
+    value: &str,
+    most: f64,
+    allowed: &'static str,
+) -> Result<f64, SelectorError> {
+    let number = value.parse().ok().filter(|number: &f64| number.abs() <= most);
+    number.ok_or_else(|| SelectorError::NoNumber { name, value: excerpt(value), allowed })
+}
+
+/// Seconds as decimal digits, to the nanosecond: a float would round today's date.
+fn stamp(value: &str) -> Result<Stamp, SelectorError> {
+    nanoseconds(value).map(Stamp).ok_or_else(|| SelectorError::NoNumber {
+        name: "at",
+        value: excerpt(value),
+        allowed: "seconds with at most nine decimals, as in 1700000000.25",
+    })
+}
+
+fn nanoseconds(value: &str) -> Option<i64> {
+    let (sign, digits) = value.strip_prefix('-').map_or((1, value), |digits| (-1, digits));
+    let (seconds, decimals) = digits.split_once('.').unwrap_or((digits, "0"));
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    if !is_number(seconds) || !is_number(decimals) || decimals.len() > NANOSECOND_DIGITS {
+        return None;
+    }
+    let seconds: i64 = seconds.parse().ok()?;
+    let decimals: i64 = format!("{decimals:0<NANOSECOND_DIGITS$}").parse().ok()?;
+    seconds.checked_mul(1_000_000_000)?.checked_add(decimals)?.checked_mul(sign)
+}
+
+fn map_format(parameters: &Parameters<'_>) -> Result<MapFormat, SelectorError> {
+    let columns = parameters.get("cols").map(columns).transpose()?;
+    let choices = [
+        ("cdr", MapFormat::Cdr),
+        ("json", MapFormat::Json),
+        ("png", MapFormat::Png),
+        ("pgm", MapFormat::Pgm),
+        ("yaml", MapFormat::Yaml),
+        ("text", MapFormat::Text { columns: columns.unwrap_or(USUAL_COLUMNS) }),
+    ];
+    let format = parameters.choice("format", &choices)?.unwrap_or(MapFormat::Cdr);
+    if columns.is_some() && !matches!(format, MapFormat::Text { .. }) {
+        return Err(SelectorError::ColumnsWithoutText);
+    }
+    Ok(format)
+}
+
+fn columns(value: &str) -> Result<NonZeroUsize, SelectorError> {
+    let columns = value.parse().ok().filter(|columns: &NonZeroUsize| columns.get() <= MOST_COLUMNS);
+    columns.ok_or_else(|| SelectorError::NoNumber {
+        name: "cols",
+        value: excerpt(value),
+        allowed: "a whole number from 1 to 1000",
+    })
+}
+
+fn path_format(parameters: &Parameters<'_>) -> Result<PathFormat, SelectorError> {
+    let choices = [
+        ("json", PathFormat::Message(MessageFormat::Json)),
+        ("cdr", PathFormat::Message(MessageFormat::Cdr)),
+        ("tum", PathFormat::Tum),
+    ];
+    Ok(parameters.choice("format", &choices)?.unwrap_or(choices[0].1))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use proptest::prelude::{
+        Just, Strategy as _, any, prop_assert, prop_assert_eq, prop_oneof, proptest,
+    };
+    use proptest::sample::select;
+
+    use super::*;
+
+    fn error(topic: Topic, parameters: &str) -> String {
+        topic.question(parameters).unwrap_err().to_string()
+    }
+
+    fn text(columns: usize) -> MapFormat {
+        MapFormat::Text { columns: NonZeroUsize::new(columns).unwrap() }
+    }
+
+    #[test]
+    fn without_parameters_each_topic_has_its_usual_form() {
+        let json = MessageFormat::Json;
+        let asked = |topic: Topic| topic.question("");
+        assert_eq!(asked(Topic::Map), Ok(Question::Map(MapFormat::Cdr)));
+        assert_eq!(asked(Topic::DynamicMap), Ok(Question::DynamicMap));
+        assert_eq!(asked(Topic::MapMetadata), Ok(Question::MapMetadata(json)));
+        assert_eq!(asked(Topic::Pose), Ok(Question::Pose { at: None, format: json }));
+        assert_eq!(asked(Topic::Path), Ok(Question::Path(PathFormat::Message(json))));
+        assert_eq!(asked(Topic::ParticleCloud), Ok(Question::ParticleCloud(json)));
+        assert_eq!(asked(Topic::Entropy), Ok(Question::Entropy(json)));
+        assert_eq!(asked(Topic::Status), Ok(Question::Status));
+        assert_eq!(asked(Topic::Reset), Ok(Question::Reset(None)));
+        assert_eq!(asked(Topic::Pause), Ok(Question::Pause));
+        assert_eq!(asked(Topic::Resume), Ok(Question::Resume));
+        assert_eq!(asked(Topic::InitialPose), Err(SelectorError::NoPose));
+        assert_eq!(asked(Topic::Save), Ok(Question::Save(SaveName::default())));
+    }
+
+    #[test]
+    fn formats_are_words() {
+        let formats = [
+            ("cdr", MapFormat::Cdr),
+            ("json", MapFormat::Json),
+            ("png", MapFormat::Png),
+            ("pgm", MapFormat::Pgm),
+            ("yaml", MapFormat::Yaml),
+            ("text", text(80)),
+            ("text;cols=100", text(100)),
+        ];
+        for (words, format) in formats {
+            let asked = Topic::Map.question(&format!("format={words}"));
+            assert_eq!(asked, Ok(Question::Map(format)), "{words}");
+        }
+        assert_eq!(
+            Topic::Map.question("cols=12;format=text"),
+            Ok(Question::Map(text(12))),
+            "the order does not matter"
+        );
+        assert_eq!(Topic::Path.question("format=tum"), Ok(Question::Path(PathFormat::Tum)));
+        assert_eq!(
+            Topic::Entropy.question("format=cdr"),
+            Ok(Question::Entropy(MessageFormat::Cdr))
+        );
+    }
+
+    #[test]
+    fn errors_name_the_part_and_list_what_is_allowed() {
+        assert_eq!(
+            error(Topic::Map, "fromat=png"),
+            "there is no parameter \"fromat\" here; allowed are format, cols"
+        );
+        assert_eq!(
+            error(Topic::Map, "format=pgn"),
+            "format=\"pgn\" is not known; allowed are cdr, json, png, pgm, yaml, text"
+        );
+        assert_eq!(
+            error(Topic::Map, "format"),
+            "format=\"\" is not known; allowed are cdr, json, png, pgm, yaml, text"
+        );
+        assert_eq!(
+            error(Topic::Map, "format=text;cols=0"),
+            "cols=\"0\" is not allowed; it must be a whole number from 1 to 1000"
+        );
+        assert_eq!(
+            error(Topic::Map, "format=png;cols=9"),
+            "cols is only for format=text; leave it out, or ask for format=text"
+        );
+        assert_eq!(
+            error(Topic::Map, "format=png;format=pgm"),
+            "the parameter format is given twice; give it once"
+        );
+        assert_eq!(
+            error(Topic::Status, "format=cdr"),
+            "format=\"cdr\" is not known; allowed are json"
+        );
+        assert_eq!(
+            error(Topic::Pause, "now"),
+            "there is no parameter \"now\" here; none is allowed"
+        );
+        assert_eq!(
+            error(Topic::Reset, "x=1;yaw=0"),
+            "y is missing: a pose needs x and y in metres and yaw in radians"
+        );
+        assert_eq!(
+            error(Topic::InitialPose, "x=1;y=2;yaw=90"),
+            "yaw=\"90\" is not allowed; it must be a number of radians from -6.283 to 6.283"
+        );
+    }
+
+    #[test]
+    fn zenohs_own_parameters_are_passed_over() {
+        let asked = Topic::Map.question("_anyke;_time=[now(-1s)..];format=png;");
+        assert_eq!(asked, Ok(Question::Map(MapFormat::Png)));
+    }
+
+    #[test]
+    fn the_service_of_slam_gmapping_takes_whatever_comes() {
+        assert_eq!(Topic::DynamicMap.question("x=1;x=1;;=;format"), Ok(Question::DynamicMap));
+    }
+
+    #[test]
+    fn stamps_are_exact() {
+        let at = |value: &str| match Topic::Pose.question(&format!("at={value}")) {
+            Ok(Question::Pose { at, .. }) => at.map(|stamp| stamp.0),
+            _ => None,
+        };
+        assert_eq!(at("1700000000.123456789"), Some(1_700_000_000_123_456_789));
+        assert_eq!(at("12"), Some(12_000_000_000));
+        assert_eq!(at("12.5"), Some(12_500_000_000));
+        assert_eq!(at("-0.000000001"), Some(-1));
+        for nonsense in ["", ".", "-", "1.", ".5", "1e9", "+1", "0.1234567891", "9223372037", "١"]
+        {
+            assert_eq!(at(nonsense), None, "{nonsense}");
+        }
+        assert_eq!(
+            error(Topic::Pose, "at=noon"),
+            "at=\"noon\" is not allowed; \
+             it must be seconds with at most nine decimals, as in 1700000000.25"
+        );
+    }
+
+    #[test]
+    fn poses_are_finite_and_their_headings_wrapped() {
+        let asked = Topic::InitialPose.question("x=1.5;y=-2e1;yaw=3.5");
+        let Ok(Question::InitialPose(pose)) = asked else { panic!("{asked:?}") };
+        assert_eq!((pose.x, pose.y), (1.5, -20.0));
+        assert!((pose.theta - (3.5 - TAU)).abs() < 1e-12 && pose.theta > -PI);
+        for nonsense in ["nan", "inf", "1e400", "1e7", "", "one"] {
+            let asked = Topic::Reset.question(&format!("x={nonsense};y=0;yaw=0"));
+            let named = format!("x={nonsense:?}");
+            assert!(asked.unwrap_err().to_string().starts_with(&named), "{nonsense}");
+        }
+    }
+
+    #[test]
+    fn an_error_does_not_grow_with_the_query() {
+        let long = "é".repeat(100_000);
+        assert!(error(Topic::Map, &long).len() < 300);
+        assert!(error(Topic::Map, &format!("format={long}")).len() < 300);
+        assert!(error(Topic::Save, &format!("name={long}")).len() < 300);
+    }
+
+    proptest! {
+        /// Whatever is asked, the answer is a question or an error with the offending part.
+        #[test]
+        fn no_query_is_a_disaster(
+            topic in select(Topic::ALL.to_vec()),
+            name in prop_oneof![
+                select(vec!["format", "cols", "at", "x", "y", "yaw", "name"]).prop_map(str::to_owned),
+                "[^_].{0,80}",
+            ],
+            value in prop_oneof![any::<String>(), Just("png".to_owned()), Just("1".to_owned())],
+        ) {
+            use SelectorError as Error;
+            let text = format!("{name}={value}");
+            let told = match topic.question(&text) {
+                Err(Error::Unknown { name, .. }) => name,
+                Err(Error::NoChoice { value, .. } | Error::NoNumber { value, .. }) => value,
+                Err(Error::Name(error)) => error.given,
+                Err(Error::PartOfPose(part)) => {
+                    let given = format!("{part}=");
+                    prop_assert!(!text.starts_with(&given));
+                    return Ok(());
+                }
+                Err(error) => {
+                    prop_assert!(!error.to_string().is_empty());
+                    return Ok(());
+                }
+                Ok(_) => return Ok(()),
+            };
+            prop_assert!(text.contains(told.trim_end_matches('…')), "{told:?} is not in {text:?}");
+        }
+
+        #[test]
+        fn every_string_is_taken(topic in select(Topic::ALL.to_vec()), text in any::<String>()) {
+            if let Err(error) = topic.question(&text) {
+                prop_assert!(error.to_string().len() < 600);
+            }
+        }
+
+        #[test]
+        fn every_stamp_reads_back(stamp in any::<i64>()) {
+            let sign = if stamp < 0 { "-" } else { "" };
+            let nanoseconds = stamp.unsigned_abs();
+            let (seconds, rest) = (nanoseconds / 1_000_000_000, nanoseconds % 1_000_000_000);
+            let asked = Topic::Pose.question(&format!("at={sign}{seconds}.{rest:09}"));
+            if stamp == i64::MIN {
+                prop_assert!(asked.is_err());
+            } else {
+                let format = MessageFormat::Json;
+                prop_assert_eq!(asked, Ok(Question::Pose { at: Some(Stamp(stamp)), format }));
+            }
+        }
+    }
+}
