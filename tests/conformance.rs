@@ -2,7 +2,7 @@
 //!
 //! Cases of the daemon are not here, since the core knows neither transforms nor a clock nor a
 //! file: odometry later than the scan by more than a timeout, a laser tilted by 3 degrees (both
-//! are decided before a scan reaches the core), pause, reset and resume, and a checkpoint in the
+//! are decided before a scan reaches the core), pause and resume, and a checkpoint in the
 //! middle of a resample.
 
 use std::f64::consts::TAU;
@@ -13,8 +13,8 @@ use gmapd::sim::lidar::Lidar;
 use gmapd::sim::world::World;
 use gmapd::sim::{Reading, Simulation};
 use gmapd::slam::gmapping::{
-    GMapping, JumpGuard, JumpPolicy, MatcherKind, OdometryUpdate, Parameters, ScanReading,
-    ScanReport, ScanUpdate, SkipReason,
+    GMapping, JumpGuard, JumpPolicy, MatcherKind, OdometryUpdate, Parameters, Particle,
+    ScanReading, ScanReport, ScanUpdate, SkipReason,
 };
 use gmapd::slam::grid::occupancy::OccupancyGrid;
 use gmapd::slam::motion_gate::MotionGate;
@@ -670,4 +670,53 @@ fn two_runs_with_the_same_seed_are_identical_on_any_number_of_threads() {
         assert_eq!(run(1, threads), one, "{threads} threads");
     }
     assert_ne!(run(2, 1).1, one.1);
+}
+
+#[test]
+fn a_reset_filter_maps_as_a_new_one_does() {
+    let lidar = full_circle(180);
+    let shots = shots(&room(CORNER), &lidar, &route(CORNER));
+    let mut filter = driven(&parameters(), &lidar, &shots[..15]);
+    filter.reset(None);
+    assert!(filter.particles().is_empty() && filter.occupancy_grid().is_none());
+    for shot in &shots {
+        add(&mut filter, &lidar, shot);
+    }
+    let new = driven(&parameters(), &lidar, &shots);
+    assert_eq!(filter.path(), new.path());
+    assert_eq!(filter.occupancy_grid(), new.occupancy_grid());
+
+    filter.reset(Some(Pose2::new(7.0, 8.0, 0.5)));
+    add(&mut filter, &lidar, &shots[3]);
+    assert_near(filter.pose_in_map(), Pose2::new(7.0, 8.0, 0.5), [1e-12, 1e-12]);
+}
+
+#[test]
+fn a_pose_that_is_set_moves_all_particles_and_keeps_them_apart() {
+    let lidar = full_circle(180);
+    let shots = shots(&room(CORNER), &lidar, &route(CORNER));
+    let mut filter = driven(&parameters(), &lidar, &shots[..10]);
+    filter.add_odometry(shots[10].odom_from_base);
+    let pose = |particle: &Particle| particle.pose_in_map();
+    let best = filter.best().map(pose).unwrap();
+    let apart: Vec<Pose2> = filter.particles().iter().map(|p| best.between(pose(p))).collect();
+    assert!(apart.iter().any(|pose| pose.position().norm() > 1e-6), "all particles are alike");
+
+    let place = Pose2::new(-3.0, 4.0, 2.0);
+    filter.set_pose(place);
+    assert_near(filter.pose_in_map(), place, [1e-9, 1e-9]);
+    let best = filter.best().map(pose).unwrap();
+    for (particle, apart) in filter.particles().iter().zip(apart) {
+        assert_near(best.between(pose(particle)), apart, [1e-9, 1e-9]);
+    }
+}
+
+#[test]
+fn a_pose_that_is_set_before_the_first_scan_is_where_the_map_begins() {
+    let lidar = full_circle(180);
+    let shots = shots(&room(CORNER), &lidar, &route(CORNER));
+    let mut filter = filter(&parameters());
+    filter.set_pose(Pose2::new(-3.0, 4.0, 2.0));
+    add(&mut filter, &lidar, &shots[0]);
+    assert_near(filter.pose_in_map(), Pose2::new(-3.0, 4.0, 2.0), [1e-12, 1e-12]);
 }

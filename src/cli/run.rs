@@ -1,5 +1,6 @@
 //! `gmapd run`: the daemon, until a signal ends it.
 
+use std::io::IsTerminal as _;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -72,7 +73,11 @@ fn start_log() -> anyhow::Result<()> {
         Some(EnvFilter::try_new(directives).with_context(|| format!("{name} is no log filter")))
     });
     let filter = set.unwrap_or_else(|| Ok(EnvFilter::new(LOG_FILTER)))?;
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr)
+        .init();
     Ok(())
 }
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, anyhow};
 use clap::Args;
+use gmapd::daemon::keys::plain_message;
 
 /// Where the mesh is.
 ///
@@ -46,7 +47,7 @@ impl SessionArguments {
 
     async fn open_with(&self, config: zenoh::Config) -> anyhow::Result<zenoh::Session> {
         zenoh::open(config).await.map_err(|error| {
-            let error = anyhow!(error);
+            let error = anyhow!(plain_message(&error));
             if self.connect.is_empty() {
                 error.context("cannot open a Zenoh session")
             } else {
@@ -61,7 +62,7 @@ impl SessionArguments {
     fn config(&self) -> anyhow::Result<zenoh::Config> {
         let mut config = match &self.zenoh {
             Some(path) => zenoh::Config::from_file(path).map_err(|error| {
-                anyhow!(error)
+                anyhow!(plain_message(&error))
                     .context(format!("cannot use Zenoh's configuration {}", path.display()))
             })?,
             None => zenoh::Config::default(),
@@ -86,7 +87,7 @@ fn json(endpoints: &[String]) -> anyhow::Result<String> {
 fn insert(config: &mut zenoh::Config, key: &str, value: &str) -> anyhow::Result<()> {
     config
         .insert_json5(key, value)
-        .map_err(|error| anyhow!(error).context(format!("Zenoh does not take {value} as {key}")))
+        .map_err(|error| anyhow!("Zenoh does not take {value} as {key}: {}", plain_message(&error)))
 }
 
 #[cfg(test)]

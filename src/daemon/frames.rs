@@ -51,7 +51,7 @@ pub enum MountError {
         /// The base's frame.
         base: String,
         /// What is missing.
-        reason: TfError,
+        reason: Box<TfError>,
         /// The key of static transforms.
         tf_static: String,
     },
@@ -141,7 +141,7 @@ impl Frames {
                 MountError::Unknown {
                     laser: laser.to_owned(),
                     base: base.clone(),
-                    reason,
+                    reason: Box::new(reason),
                     tf_static: self.tf_static.clone(),
                 }
             })?;

@@ -11,9 +11,11 @@ use zenoh::sample::{Sample, SampleKind};
 use super::ledger::Verdict;
 use super::mailbox::{Mail, Mailbox};
 use super::synchronizer::{FramedScan, Refusal};
+use crate::clock;
+use crate::convert;
+use crate::ros;
 use crate::slam::pose::Stamp;
 use crate::tf::Kind;
-use crate::{clock, convert, ros};
 
 /// Payloads above this are not looked at: a sweep of 10000 beams has less than a tenth of it.
 const LARGEST_PAYLOAD: usize = 4 << 20;
@@ -338,5 +340,87 @@ pub const fn input_of(kind: Kind) -> Input {
     match kind {
         Kind::Static => Input::TfStatic,
         Kind::Dynamic => Input::Tf,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::daemon::mailbox::Event;
+
+    fn payload(length: usize) -> Content {
+        Content::Payload(vec![7; length].into())
+    }
+
+    fn put(inbox: &Inbox, input: Input, length: usize) {
+        inbox.put(input, payload(length), String::new());
+    }
+
+    /// What is in the mailbox after all has been decoded.
+    async fn decoded(inbox: Inbox) -> Vec<Verdict> {
+        let mailbox = Arc::new(Mailbox::new(4));
+        inbox.close();
+        decode(Arc::new(inbox), Arc::clone(&mailbox)).await;
+        let verdict = |event| match event {
+            Event::Refusal(refusal) => refusal.verdict,
+            other => panic!("{other:?}"),
+        };
+        std::iter::from_fn(|| mailbox.take(clock::now()).map(verdict)).collect()
+    }
+
+    #[tokio::test]
+    async fn scans_that_come_too_fast_are_counted_and_have_a_verdict() {
+        let inbox = Inbox::default();
+        (0..MOST_SCANS + 3).for_each(|_| put(&inbox, Input::Scan, 10));
+        (0..=MOST_OTHERS).for_each(|_| put(&inbox, Input::Odom, 10));
+        let tallies = [Input::Scan, Input::Odom].map(|input| inbox.tally(input));
+        assert_eq!(tallies.map(|tally| tally.dropped), [3, 1]);
+        let verdicts = decoded(inbox).await;
+        let count = |verdict| verdicts.iter().filter(|other| **other == verdict).count();
+        assert_eq!((count(Verdict::Overload), count(Verdict::NotDecodable)), (3, MOST_SCANS));
+    }
+
+    #[tokio::test]
+    async fn memory_is_bounded_by_bytes_as_well() {
+        let inbox = Inbox::default();
+        (0..9).for_each(|_| put(&inbox, Input::Odom, LARGEST_PAYLOAD));
+        assert_eq!(inbox.tally(Input::Odom).dropped, 1);
+        inbox.put(Input::Scan, Content::TooLarge(LARGEST_PAYLOAD + 1), String::new());
+        inbox.put(Input::Scan, Content::Deleted, String::new());
+        assert_eq!(inbox.lock().queues[&Input::Scan].bytes, 0);
+        inbox.lock().queues.remove(&Input::Odom);
+        assert_eq!(decoded(inbox).await, [Verdict::NotDecodable; 2]);
+    }
+
+    #[tokio::test]
+    async fn samples_are_decoded_in_the_order_of_arrival() {
+        let inbox = Inbox::default();
+        let order = [Input::Scan, Input::TfStatic, Input::Odom, Input::Scan, Input::Tf];
+        order.iter().for_each(|input| put(&inbox, *input, 1));
+        inbox.close();
+        let mut decoded = Vec::new();
+        while let Some(Next::Sample(input, _)) = inbox.next().await {
+            decoded.push(input);
+        }
+        assert_eq!(decoded, order);
+    }
+
+    #[tokio::test]
+    async fn any_bytes_are_a_rejection_and_no_panic() {
+        let inbox = Inbox::default();
+        for input in Input::ALL {
+            for length in [0, 1, 3, 4, 5, 100] {
+                put(&inbox, input, length);
+                inbox.put(input, payload(length), "application/json".to_owned());
+            }
+        }
+        let inbox = Arc::new(inbox);
+        inbox.close();
+        decode(Arc::clone(&inbox), Arc::new(Mailbox::new(4))).await;
+        for input in Input::ALL {
+            let tally = inbox.tally(input);
+            assert_eq!((tally.received, tally.rejected), (12, 12), "{input:?}");
+            assert!(tally.last_rejection.is_some() && tally.last.is_some());
+        }
     }
 }

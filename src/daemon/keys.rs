@@ -95,15 +95,23 @@ fn name(names: &Keys, input: Input) -> &str {
 }
 
 fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
-    if text.contains(['*', '$']) {
+    // Zenoh would call `robot*` malformed, and say no word of wildcards.
+    if text.contains('*') {
         return Err(KeyError::Wildcard(text.to_owned()));
     }
-    let key = KeyExpr::autocanonize(text.to_owned()).map_err(|error| {
-        // Zenoh adds where in its own sources it said so.
-        let reason = error.to_string().split(" at /").next().unwrap_or_default().to_owned();
-        KeyError::Invalid { key: text.to_owned(), reason }
+    let key = KeyExpr::autocanonize(text.to_owned()).map_err(|error| KeyError::Invalid {
+        key: text.to_owned(),
+        reason: plain_message(&error),
     })?;
     Ok(key.into())
+}
+
+/// What Zenoh says is wrong, without the place in its sources where it noticed.
+#[must_use]
+pub fn plain_message(error: &zenoh::Error) -> String {
+    let text = error.to_string();
+    let message = text.split_once(" at /").map_or(text.as_str(), |(message, _)| message);
+    message.trim_end_matches(['!', ' ', '.']).to_owned()
 }
 
 #[cfg(test)]
@@ -131,6 +139,10 @@ mod tests {
         assert_eq!(key("/site/robot01/", "slam/status").unwrap(), "site/robot01/slam/status");
         assert_eq!(key("", "scan").unwrap(), "scan");
         assert_eq!(key("robot*", "map"), Err(KeyError::Wildcard("robot*".to_owned())));
-        assert!(matches!(key("robot01", "a//b"), Err(KeyError::Invalid { .. })));
+        let error = key("robot01", "a//b").unwrap_err().to_string();
+        assert!(
+            error.starts_with("\"robot01/a//b\" is no key: ") && !error.contains(".rs"),
+            "{error}"
+        );
     }
 }

@@ -41,7 +41,7 @@ use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryCo
 use self::command::Request;
 use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
-use self::keys::{InputKeys, KeyError, Prefix};
+use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
@@ -69,7 +69,7 @@ const COMMANDS: usize = 16;
 const STATIC_TRANSFORMS: usize = 100;
 
 /// How often the state is looked at, to log what changed.
-const LOOK: Duration = Duration::from_secs(1);
+const LOOK: Duration = Duration::from_secs(2);
 
 /// What to run.
 #[derive(Debug, Clone)]
@@ -101,12 +101,12 @@ pub enum DaemonError {
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
     /// Zenoh takes no subscriber.
-    #[error("cannot subscribe to {key}")]
+    #[error("cannot subscribe to {key}: {reason}")]
     Subscribe {
         /// The key.
         key: String,
         /// What Zenoh says.
-        source: zenoh::Error,
+        reason: String,
     },
     /// A bug: the thread `mapper` ended though nobody asked it to.
     #[error("the thread that maps ended unexpectedly")]
@@ -342,7 +342,7 @@ async fn subscribe(
 ) -> Result<Subscribers, DaemonError> {
     let failed = |input| {
         let key = keys.of(input).to_string();
-        move |source| DaemonError::Subscribe { key, source }
+        move |error| DaemonError::Subscribe { key, reason: plain_message(&error) }
     };
     let mut changing = Vec::new();
     for input in [Input::Tf, Input::Odom, Input::Scan] {

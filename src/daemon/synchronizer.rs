@@ -127,8 +127,14 @@ impl Waiting {
 struct Lack {
     verdict: Verdict,
     detail: String,
-    /// Whether what it lacks cannot come any more.
-    hopeless: bool,
+    chance: Chance,
+}
+
+/// Whether what a scan lacks may still come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Chance {
+    MayCome,
+    Gone,
 }
 
 /// Scans and odometry on their way to the filter.
@@ -314,11 +320,16 @@ impl Synchronizer {
         Some((newest, self.odometry.at(newest).ok()?))
     }
 
-    /// How many scans wait.
+    /// How many scans wait for what they lack.
     #[must_use]
     pub fn waiting(&self) -> usize {
-        let ready = self.calls.iter().filter(|call| matches!(call, Call::Scan(_))).count();
-        self.waiting.len() + ready
+        self.waiting.len()
+    }
+
+    /// How many scans are ready and not called yet.
+    #[must_use]
+    pub fn ready(&self) -> usize {
+        self.calls.iter().filter(|call| matches!(call, Call::Scan(_))).count()
     }
 
     /// Where odometry comes from; `None` before the first.
@@ -350,7 +361,7 @@ impl Synchronizer {
                     self.taken = Some(scan.stamp);
                     self.calls.push_back(Call::Scan(ReadyScan { scan, mount, odom_from_base }));
                 }
-                Err(lack) if lack.hopeless => {
+                Err(lack) if lack.chance == Chance::Gone => {
                     self.refuse(first.stamp(), lack.verdict, lack.detail);
                 }
                 Err(_) => {
@@ -377,12 +388,12 @@ impl Synchronizer {
     fn place(&self, framed: &FramedScan, frames: &Frames) -> Result<(LaserMount, Pose2), Lack> {
         let stamp = framed.scan.stamp;
         let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
-            let (verdict, hopeless) = match error {
-                MountError::Tilted { .. } => (Verdict::TiltedMount, true),
-                MountError::NoFrame { .. } => (Verdict::NoMount, true),
-                MountError::Unknown { .. } => (Verdict::NoMount, false),
+            let (verdict, chance) = match error {
+                MountError::Tilted { .. } => (Verdict::TiltedMount, Chance::Gone),
+                MountError::NoFrame { .. } => (Verdict::NoMount, Chance::Gone),
+                MountError::Unknown { .. } => (Verdict::NoMount, Chance::MayCome),
             };
-            Lack { verdict, detail: error.to_string(), hopeless }
+            Lack { verdict, detail: error.to_string(), chance }
         })?;
         Ok((mount, self.odometry_at(stamp)?))
     }
@@ -395,24 +406,29 @@ impl Synchronizer {
         let next = self.odometry.next(stamp);
         match (self.odometry.at(stamp), next.filter(|next| too_late(*next))) {
             (Ok(odom_from_base), None) => Ok(odom_from_base),
-            (Ok(_), Some(next)) => {
-                Err(self.lack(next.seconds_since(stamp), "the next is newer than the scan", true))
-            }
+            (Ok(_), Some(next)) => Err(self.lack(
+                next.seconds_since(stamp),
+                "the next is newer than the scan",
+                Chance::Gone,
+            )),
             (Err(Missing::TooOld(by)), _) => {
-                let hopeless = self.odometry.newest().is_some_and(too_late);
-                Err(self.lack(by.as_secs_f64(), "the oldest is newer than the scan", hopeless))
+                let gone = self.odometry.newest().is_some_and(too_late);
+                let chance = if gone { Chance::Gone } else { Chance::MayCome };
+                Err(self.lack(by.as_secs_f64(), "the oldest is newer than the scan", chance))
             }
-            (Err(Missing::TooNew(by)), _) => {
-                Err(self.lack(by.as_secs_f64(), "the newest is older than the scan", false))
-            }
+            (Err(Missing::TooNew(by)), _) => Err(self.lack(
+                by.as_secs_f64(),
+                "the newest is older than the scan",
+                Chance::MayCome,
+            )),
             (Err(Missing::Empty), _) => {
                 let detail = format!("no odometry has come {}", self.origin());
-                Err(Lack { verdict: Verdict::NoOdometry, detail, hopeless: false })
+                Err(Lack { verdict: Verdict::NoOdometry, detail, chance: Chance::MayCome })
             }
         }
     }
 
-    fn lack(&self, missing_s: f64, what: &str, hopeless: bool) -> Lack {
+    fn lack(&self, missing_s: f64, what: &str, chance: Chance) -> Lack {
         let remedy = if missing_s > CLOCKS_DIFFER_S {
             "do the clocks that stamp them agree, and does odometry still come?"
         } else {
@@ -423,7 +439,7 @@ impl Synchronizer {
         let detail = format!(
             "odometry is missing by {milliseconds:.1} ms: {what} by that, of those {origin}; {remedy}"
         );
-        Lack { verdict: Verdict::NoOdometry, detail, hopeless }
+        Lack { verdict: Verdict::NoOdometry, detail, chance }
     }
 
     /// Where odometry comes from or is expected, in words.
@@ -436,3 +452,6 @@ impl Synchronizer {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
