@@ -189,7 +189,7 @@ impl Daemon {
             snapshots: snapshots.clone(),
             verdicts: verdicts.subscribe(),
             commands: commands.clone(),
-            status: serving::StatusSource::new(move || source.status()),
+            status: serving::AskStatus::new(move || source.status()),
         };
         let served = serving::Settings::new(&config, config.raw.save_directory.clone().into());
         let serving = Some(Serving::start(session, &prefix, served, sources).await?);
@@ -253,6 +253,7 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
+        // Here the map is saved, if save_on_exit says so.
         if let Some(serving) = self.serving.take() {
             tokio::time::timeout(CLOSE, serving.stop()).await.ok();
         }
