@@ -11,9 +11,11 @@ use zenoh::sample::{Sample, SampleKind};
 use super::ledger::Verdict;
 use super::mailbox::{Mail, Mailbox};
 use super::synchronizer::{FramedScan, Refusal};
+use crate::clock;
+use crate::convert;
+use crate::ros;
 use crate::slam::pose::Stamp;
 use crate::tf::Kind;
-use crate::{clock, convert, ros};
 
 /// Payloads above this are not looked at: a sweep of 10000 beams has less than a tenth of it.
 const LARGEST_PAYLOAD: usize = 4 << 20;

@@ -85,6 +85,8 @@ pub struct Mapper {
     frames: Frames,
     view: View,
     gauges: Gauges,
+    /// Verdicts since the last snapshot.
+    untold: Vec<Entry>,
 }
 
 /// What goes into the next snapshot.
@@ -175,6 +177,7 @@ impl Mapper {
             frames: frames(config, keys),
             view: View::new(),
             gauges: Gauges::default(),
+            untold: Vec::new(),
         };
         mapper.renew_estimate(None);
         mapper.publish();
@@ -201,16 +204,10 @@ impl Mapper {
         self.handle(event)
     }
 
-    /// What the mailbox holds next; while it is empty, the map is brought up to date.
-    fn next_event(&mut self) -> Event {
-        if let Some(event) = self.connections.mailbox.take(clock::now()) {
-            return event;
-        }
-        if self.view.unpublished.is_some() {
-            self.renew_map();
-            self.publish();
-        }
-        self.connections.mailbox.wait(self.synchronizer.deadline(), clock::now)
+    fn next_event(&self) -> Event {
+        let mailbox = &self.connections.mailbox;
+        let event = mailbox.take(clock::now());
+        event.unwrap_or_else(|| mailbox.wait(self.synchronizer.deadline(), clock::now))
     }
 
     fn handle(&mut self, event: Event) -> Flow {
@@ -366,11 +363,11 @@ impl Mapper {
         self.view.changed = true;
         let entry = self.view.ledger.enter(stamp, verdict, detail);
         tracing::trace!(number = entry.number, ?verdict, detail = entry.detail, "scan");
-        // Nobody may be listening.
-        self.connections.verdicts.send(entry.clone()).ok();
+        self.untold.push(entry.clone());
         push_bounded(&mut self.gauges.recent, verdict, RECENT);
     }
 
+    /// Whoever gets the answer finds it in the snapshot, too.
     fn obey(&mut self, request: Request) {
         let (done, changed) = match request.command {
             Command::Pause => self.pause(),
@@ -440,18 +437,30 @@ impl Mapper {
         self.publish();
     }
 
+    /// Whoever hears of a verdict finds it in the snapshot.
     fn publish(&mut self) {
+        if self.connections.mailbox.scans() == 0 && self.synchronizer.ready() == 0 {
+            self.renew_map();
+        }
+        self.publish_gauges();
+        if std::mem::take(&mut self.view.changed) {
+            self.connections.snapshots.send_replace(Arc::new(self.view.snapshot()));
+        }
+        for entry in self.untold.drain(..) {
+            // Nobody may be listening.
+            self.connections.verdicts.send(entry).ok();
+        }
+    }
+
+    fn publish_gauges(&mut self) {
         let gauges = &mut self.gauges;
-        gauges.scans_waiting = self.synchronizer.waiting();
+        gauges.scans_waiting = self.synchronizer.waiting() + self.synchronizer.ready();
         gauges.channel = self.synchronizer.channel();
         gauges.odometry = self.synchronizer.odometry_counts();
         gauges.scans = self.synchronizer.scan_counts();
         gauges.transforms = self.frames.counts();
         let shared = &self.connections.gauges;
         shared.lock().unwrap_or_else(PoisonError::into_inner).clone_from(gauges);
-        if std::mem::take(&mut self.view.changed) {
-            self.connections.snapshots.send_replace(Arc::new(self.view.snapshot()));
-        }
     }
 }
 

@@ -320,11 +320,16 @@ impl Synchronizer {
         Some((newest, self.odometry.at(newest).ok()?))
     }
 
-    /// How many scans wait.
+    /// How many scans wait for what they lack.
     #[must_use]
     pub fn waiting(&self) -> usize {
-        let ready = self.calls.iter().filter(|call| matches!(call, Call::Scan(_))).count();
-        self.waiting.len() + ready
+        self.waiting.len()
+    }
+
+    /// How many scans are ready and not called yet.
+    #[must_use]
+    pub fn ready(&self) -> usize {
+        self.calls.iter().filter(|call| matches!(call, Call::Scan(_))).count()
     }
 
     /// Where odometry comes from; `None` before the first.
