@@ -272,6 +272,7 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
+        // Here the map is saved, if save_on_exit says so.
         if let Some(serving) = self.serving.take() {
             tokio::time::timeout(CLOSE, serving.stop()).await.ok();
         }
