@@ -14,8 +14,12 @@ use serde_json::{Value, json};
 use zenoh::{Session, Wait as _};
 
 const CLIENTS: usize = 20;
+/// As fast as it goes, a minute of the log takes about half a second: new maps come not much more
+/// often than in real time.
+const MAP_EACH: &str = "map_update_interval=60";
 /// Between two bursts of queries.
 const PAUSE: Duration = Duration::from_millis(250);
+const IDLE_BURSTS: usize = 10;
 const GMAPD: &str = env!("CARGO_BIN_EXE_gmapd");
 const BARE: &str = "bare/map";
 
@@ -31,10 +35,8 @@ impl Drop for Process {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
-    if let [_, mode, size] = arguments.as_slice()
-        && mode == "bare"
-    {
-        return serve_bare(size.parse().expect("a number of bytes"));
+    if arguments.get(1).is_some_and(|mode| mode == "bare") {
+        return serve_bare();
     }
     let directory = tempfile::tempdir().expect("a temporary directory");
     let log = directory.path().join("sim.log");
@@ -46,13 +48,12 @@ fn main() {
     let asked = drive(&log, true);
     let growth = |name: &str| asked.scan[name].as_f64().zip(alone.scan[name].as_f64());
     let growth = growth("p50").map(|(asked, alone)| asked / alone);
-    let (daemon, bare) = (asked.daemon.expect("replies"), asked.bare.expect("replies"));
     println!(
         "{:#}",
         json!({
             "clients": CLIENTS,
             "map_bytes": asked.bytes,
-            "reply_ms": {"daemon": daemon, "bare": bare, "median_ratio": daemon.p50 / bare.p50},
+            "reply_ms": {"filter busy": asked.busy.figures(), "filter idle": asked.idle.figures()},
             "ms_per_scan": {"alone": alone.scan, "asked": asked.scan, "median_growth": growth},
         })
     );
@@ -65,9 +66,23 @@ fn quiet(command: &mut Command) -> &mut Command {
 /// What was measured while a log was played.
 struct Drive {
     scan: Value,
-    daemon: Option<Spread>,
-    bare: Option<Spread>,
+    busy: Replies,
+    idle: Replies,
     bytes: usize,
+}
+
+/// Milliseconds that replies took.
+#[derive(Default)]
+struct Replies {
+    daemon: Vec<f64>,
+    bare: Vec<f64>,
+}
+
+impl Replies {
+    fn figures(&self) -> Option<Value> {
+        let (daemon, bare) = (Spread::of(&self.daemon)?, Spread::of(&self.bare)?);
+        Some(json!({"daemon": daemon, "bare": bare, "median_ratio": daemon.p50 / bare.p50}))
+    }
 }
 
 /// Plays the log to a daemon of its own as fast as it goes; `asked` has clients ask meanwhile.
@@ -80,38 +95,39 @@ fn drive(log: &Path, asked: bool) -> Drive {
         "1",
         "--set",
         "particles=100",
+        "--set",
+        MAP_EACH,
         "--listen",
         "tcp/127.0.0.1:0",
     ]));
     let mut play = Command::new(GMAPD);
     play.args(["play", "--prefix", "robot01", "--rate", "max", "--connect", &endpoint]).arg(log);
     let mut play = Process(quiet(&mut play).spawn().expect("gmapd runs"));
-    let (mut daemon, mut bare, mut bytes) = (Vec::new(), Vec::new(), 0);
+    let (mut busy, mut idle, mut bytes) = (Replies::default(), Replies::default(), 0);
     if asked {
-        let first = client(&endpoint);
-        while bytes < 10_000 {
-            bytes = ask(&first, "robot01/map").1;
-        }
         let own = std::env::current_exe().expect("this program has a path");
-        let (_bare, bare_endpoint) = start(Command::new(own).args(["bare", &bytes.to_string()]));
+        let (_bare, bare_endpoint) = start(Command::new(own).arg("bare"));
         let clients: Vec<[Session; 2]> =
             (0..CLIENTS).map(|_| [client(&endpoint), client(&bare_endpoint)]).collect();
+        let mut ask_both = |replies: &mut Replies| {
+            let daemons = clients.iter().map(|[daemon, _]| daemon);
+            let (times, size) = burst(daemons, "robot01/map");
+            replies.daemon.extend(times);
+            bytes = size;
+            std::thread::sleep(PAUSE);
+            let bare = clients.iter().map(|[_, bare]| bare);
+            replies.bare.extend(burst(bare, &format!("{BARE}?size={size}")).0);
+            std::thread::sleep(PAUSE);
+        };
         while play.0.try_wait().expect("it is our child").is_none() {
-            daemon.extend(burst(clients.iter().map(|[daemon, _]| daemon), "robot01/map"));
-            std::thread::sleep(PAUSE);
-            bare.extend(burst(clients.iter().map(|[_, bare]| bare), BARE));
-            std::thread::sleep(PAUSE);
+            ask_both(&mut busy);
         }
+        (0..IDLE_BURSTS).for_each(|_| ask_both(&mut idle));
     }
     assert!(play.0.wait().expect("it is our child").success(), "play failed");
     let status = ask(&client(&endpoint), "robot01/slam/status").2;
     let status: Value = serde_json::from_slice(&status).expect("the status is JSON");
-    Drive {
-        scan: status["milliseconds_per_scan"].clone(),
-        daemon: Spread::of(&daemon),
-        bare: Spread::of(&bare),
-        bytes,
-    }
+    Drive { scan: status["milliseconds_per_scan"].clone(), busy, idle, bytes }
 }
 
 /// Starts a server and returns where it listens, as its first lines tell.
@@ -162,17 +178,19 @@ fn ask(client: &Session, key: &str) -> (f64, usize, Vec<u8>) {
     (start.elapsed().as_secs_f64() * 1e3, payload.len(), payload)
 }
 
-/// All clients ask at once.
-fn burst<'a>(clients: impl Iterator<Item = &'a Session>, key: &str) -> Vec<f64> {
+/// All clients ask at once: milliseconds until each had its reply, and the longest reply.
+fn burst<'a>(clients: impl Iterator<Item = &'a Session>, key: &str) -> (Vec<f64>, usize) {
     std::thread::scope(|scope| {
-        let threads: Vec<_> =
-            clients.map(|client| scope.spawn(move || ask(client, key).0)).collect();
-        threads.into_iter().map(|thread| thread.join().expect("no panic")).collect()
+        let threads: Vec<_> = clients.map(|client| scope.spawn(move || ask(client, key))).collect();
+        let replies: Vec<_> =
+            threads.into_iter().map(|thread| thread.join().expect("no panic")).collect();
+        let longest = replies.iter().map(|reply| reply.1).max().unwrap_or(0);
+        (replies.into_iter().map(|reply| reply.0).collect(), longest)
     })
 }
 
-/// Answers every query with as many bytes, until killed.
-fn serve_bare(size: usize) {
+/// Answers every query with as many bytes as its parameter says, until killed.
+fn serve_bare() {
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"router\""),
@@ -182,12 +200,13 @@ fn serve_bare(size: usize) {
         config.insert_json5(key, value).expect("the setting exists");
     }
     let session = zenoh::open(config).wait().expect("a session");
-    let payload = Bytes::from(vec![100_u8; size]);
+    let memory = Bytes::from(vec![100_u8; 1 << 26]);
     let _queryable = session
         .declare_queryable(BARE)
         .complete(true)
         .callback(move |query| {
-            query.reply(BARE, payload.clone()).wait().ok();
+            let size = query.parameters().get("size").and_then(|size| size.parse().ok());
+            query.reply(BARE, memory.slice(..size.unwrap_or(0))).wait().ok();
         })
         .wait()
         .expect("a queryable");
