@@ -651,6 +651,23 @@ async fn the_daemon_runs_until_it_is_told_to_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_last_map_is_saved_if_that_is_configured() {
+    let directory = tempfile::tempdir().unwrap();
+    let into = format!("save_directory={}", directory.path().join("maps").display());
+    let mut rig = Rig::mounted(&[&into, "save_on_exit=last"]).await;
+    rig.feed(&drive(1)[0]).await;
+    rig.verdict().await;
+    let snapshot = rig.end().await;
+    let saved = std::fs::read(directory.path().join("maps/last.pgm")).unwrap();
+    assert_eq!(saved, gmapd::map::pgm(&grid(&snapshot).unwrap()));
+
+    let (session, _) = listening().await;
+    let wrong = settings(&["save_on_exit=../last"]);
+    let error = Daemon::start(&session, wrong).await.unwrap_err();
+    assert!(error.to_string().starts_with("save_on_exit: "), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_key_with_a_wildcard_is_an_error() {
     let (session, _) = listening().await;
     let error = Daemon::start(&session, settings(&["keys={odom: '*'}"])).await.unwrap_err();

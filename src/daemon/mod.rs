@@ -31,26 +31,28 @@ use std::time::Duration;
 
 use thiserror::Error;
 use tokio::sync::{broadcast, mpsc, oneshot, watch};
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, spawn_blocking};
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
 use self::command::Request;
+use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
 use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
+use self::save::{NameError, SaveError, SaveName, Saver};
 use self::serving::{Serving, ServingError};
-use self::snapshot::{Snapshot, State};
+use self::snapshot::{MapVersion, Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
-use crate::config::Config;
+use crate::config::{Config, RawConfig};
 use crate::slam::gmapping::ThreadsError;
 
 /// At the end, what waits in the mailbox is worked off for this long.
-const DRAIN: Duration = Duration::from_millis(1400);
+const DRAIN: Duration = Duration::from_millis(1200);
 
 /// How long anything else may take at the end.
 const CLOSE: Duration = Duration::from_millis(200);
@@ -90,6 +92,9 @@ pub enum DaemonError {
     /// The thread `mapper` does not start.
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
+    /// No map can be saved as `save_on_exit` says.
+    #[error("save_on_exit: {0}")]
+    SaveOnExit(#[from] NameError),
     /// Nothing can be published or answered.
     #[error(transparent)]
     Serving(#[from] ServingError),
@@ -129,7 +134,7 @@ pub async fn run(
 /// A daemon that runs.
 #[derive(Debug)]
 pub struct Daemon {
-    /// `None` once undeclared.
+    /// `None` before it listens and once it does no more.
     subscribers: Option<Subscribers>,
     inbox: Arc<Inbox>,
     mailbox: Arc<Mailbox>,
@@ -140,8 +145,39 @@ pub struct Daemon {
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
     status: Arc<StatusSource>,
+    /// `None` before it has started and after it has stopped.
     serving: Option<Serving>,
     helpers: [JoinHandle<()>; 2],
+    last_save: Option<LastSave>,
+}
+
+/// What `save_on_exit` asks for.
+#[derive(Debug)]
+struct LastSave {
+    name: SaveName,
+    saver: Saver,
+    empty: EmptyMap,
+}
+
+impl LastSave {
+    fn of(config: &RawConfig) -> Result<Option<Self>, NameError> {
+        let Some(name) = &config.save_on_exit else { return Ok(None) };
+        let (frame, resolution) = (config.map_frame.clone(), config.resolution);
+        Ok(Some(Self {
+            name: SaveName::parse(name)?,
+            saver: Saver::new(config.save_directory.clone().into()),
+            empty: EmptyMap { frame, resolution },
+        }))
+    }
+
+    /// Saves the map, if there is one.
+    fn save(self, map: Option<Arc<MapVersion>>) {
+        match self.saver.save(&self.name, &MapProducts::new(map, self.empty)) {
+            Ok(saved) => tracing::info!("{}", saved.done),
+            Err(SaveError::NoMap) => tracing::info!("there is no map to save"),
+            Err(error) => tracing::error!("the map is not saved: {error}"),
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -158,6 +194,24 @@ impl Daemon {
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
         let keys = InputKeys::new(&prefix, &config.raw.keys)?;
+        let mut daemon = Self::deaf(&config, &keys, threads)?;
+        let status = Arc::clone(&daemon.status);
+        let sources = serving::Sources {
+            snapshots: daemon.snapshots(),
+            verdicts: daemon.verdicts(),
+            commands: daemon.commands(),
+            status: serving::AskStatus::new(move || status.status()),
+        };
+        let served = serving::Settings::new(&config, config.raw.save_directory.clone().into());
+        daemon.serving = Some(Serving::start(session, &prefix, served, sources).await?);
+        daemon.subscribers = Some(subscribe(session, &keys, &daemon.inbox).await?);
+        tell_keys(&keys);
+        Ok(daemon)
+    }
+
+    /// All threads and tasks of a daemon that hears and tells nothing yet.
+    fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
+        let last_save = LastSave::of(&config.raw)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
@@ -170,7 +224,7 @@ impl Daemon {
             verdicts: verdicts.clone(),
             gauges: Arc::clone(&gauges),
         };
-        let mapper = spawn(Mapper::new(connections, &config, &keys, threads)?)?;
+        let mapper = spawn(Mapper::new(connections, config, keys, threads)?)?;
         let decoder = tokio::spawn(input::decode(Arc::clone(&inbox), Arc::clone(&mailbox)));
         let shared = Shared {
             inbox: Arc::clone(&inbox),
@@ -184,19 +238,8 @@ impl Daemon {
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),
             tokio::spawn(log_changes(Arc::clone(&status))),
         ];
-        let source = Arc::clone(&status);
-        let sources = serving::Sources {
-            snapshots: snapshots.clone(),
-            verdicts: verdicts.subscribe(),
-            commands: commands.clone(),
-            status: serving::StatusSource::new(move || source.status()),
-        };
-        let served = serving::Settings::new(&config, config.raw.save_directory.clone().into());
-        let serving = Some(Serving::start(session, &prefix, served, sources).await?);
-        let subscribers = subscribe(session, &keys, &inbox).await?;
-        tell_keys(&keys);
         Ok(Self {
-            subscribers: Some(subscribers),
+            subscribers: None,
             inbox,
             mailbox,
             decoder,
@@ -205,8 +248,9 @@ impl Daemon {
             verdicts,
             commands,
             status,
-            serving,
+            serving: None,
             helpers,
+            last_save,
         })
     }
 
@@ -240,7 +284,8 @@ impl Daemon {
         (&mut self.mapper).await.ok();
     }
 
-    /// Stops listening, works off what waits for a while, and leaves the last snapshot.
+    /// Stops listening, works off what waits for a while, saves the map if that is configured, and
+    /// leaves the last snapshot.
     pub async fn stop(mut self) -> Arc<Snapshot> {
         let deadline = clock::now() + DRAIN;
         if let Some(subscribers) = self.subscribers.take() {
@@ -253,10 +298,16 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
+        let last = self.snapshots.borrow().clone();
+        let map = last.map.clone();
+        let saving = self.last_save.take().map(|save| spawn_blocking(move || save.save(map)));
         if let Some(serving) = self.serving.take() {
             tokio::time::timeout(CLOSE, serving.stop()).await.ok();
         }
-        self.snapshots.borrow().clone()
+        if let Some(saving) = saving {
+            saving.await.ok();
+        }
+        last
     }
 }
 
