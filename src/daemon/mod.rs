@@ -32,6 +32,7 @@ use std::time::Duration;
 use thiserror::Error;
 use tokio::sync::{broadcast, mpsc, oneshot, watch};
 use tokio::task::{JoinHandle, spawn_blocking};
+use zenoh::Wait as _;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
@@ -126,8 +127,9 @@ pub async fn run(
         () = daemon.mapper_ended() => Err(DaemonError::MapperEnded),
     };
     daemon.stop().await;
-    // What it would still send is not worth waiting for.
-    tokio::time::timeout(CLOSE, session.close()).await.ok();
+    // What it would still send is not worth waiting for; letting the session go could block.
+    let closing = tokio::spawn(async move { session.close().await });
+    tokio::time::timeout(CLOSE, closing).await.ok();
     ended
 }
 
@@ -289,7 +291,9 @@ impl Daemon {
     pub async fn stop(mut self) -> Arc<Snapshot> {
         let deadline = clock::now() + DRAIN;
         if let Some(subscribers) = self.subscribers.take() {
-            tokio::time::timeout(CLOSE, subscribers.undeclare()).await.ok();
+            // It blocks while the network is slow.
+            let undeclare = spawn_blocking(move || subscribers.undeclare());
+            tokio::time::timeout(CLOSE, undeclare).await.ok();
         }
         self.inbox.close();
         tokio::time::timeout(CLOSE, &mut self.decoder).await.ok();
@@ -322,11 +326,11 @@ impl Drop for Daemon {
 
 impl Subscribers {
     /// A session that is closed has none any more, which is as good.
-    async fn undeclare(self) {
+    fn undeclare(self) {
         for subscriber in self.changing {
-            subscriber.undeclare().await.ok();
+            subscriber.undeclare().wait().ok();
         }
-        self.constant.undeclare().await.ok();
+        self.constant.undeclare().wait().ok();
     }
 }
 
