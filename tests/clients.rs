@@ -83,11 +83,13 @@ impl Background {
         let err: Box<dyn Read + Send> = Box::new(child.stderr.take().expect("it is piped"));
         for stream in [out, err] {
             let sender = sender.clone();
-            thread::spawn(move || {
+            let read = move || {
                 for line in BufReader::new(stream).lines().map_while(Result::ok) {
                     sender.send(line).ok();
                 }
-            });
+            };
+            let thread = thread::Builder::new().name("output".to_owned());
+            thread.spawn(read).expect("a thread can be started");
         }
         Self { child, lines }
     }

@@ -5,15 +5,13 @@ use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
 use gmapd::daemon::keys::Prefix;
+use gmapd::daemon::serving::ALIVE;
 use zenoh::Session;
 use zenoh::bytes::ZBytes;
 use zenoh::query::{ConsolidationMode, QueryTarget};
 
 /// A daemon answers from memory; this is for the network.
 const PATIENCE: Duration = Duration::from_secs(5);
-
-/// The key of every daemon's liveliness token.
-const ALIVE: &str = "slam/alive";
 
 /// Runs what needs a session, on the runtime that Zenoh needs.
 pub(super) fn block_on<T>(work: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
