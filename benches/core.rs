@@ -13,8 +13,8 @@ use gmapd::slam::gmapping::prepared_scan::PreparedScan;
 use gmapd::slam::gmapping::resampling::{effective_sample_size, normalize, systematic};
 use gmapd::slam::gmapping::scan_matcher::FieldMatcher;
 use gmapd::slam::gmapping::{GMapping, Parameters, ScanReading};
+use gmapd::slam::grid::likelihood_field::LikelihoodField;
 use gmapd::slam::grid::occupancy::OccupancyMap;
-use gmapd::slam::grid::tile_map::TileMap;
 use gmapd::slam::motion_gate::MotionGate;
 use gmapd::slam::odometry::Motion;
 use gmapd::slam::pose::Pose2;
@@ -90,7 +90,7 @@ fn sweeps(beams: usize, count: usize) -> (LaserMount, Vec<Sweep>) {
 /// What a particle that has seen [`LEARNED`] scans at their true poses has to do with one more.
 struct Learned {
     matcher: FieldMatcher,
-    field: TileMap<u8>,
+    field: LikelihoodField,
     occupancy: OccupancyMap,
     next: PreparedScan,
     world_from_base: Pose2,
@@ -100,7 +100,7 @@ fn learned(beams: usize) -> Learned {
     let parameters = Parameters::default();
     let (mount, sweeps) = sweeps(beams, LEARNED + 1);
     let matcher = FieldMatcher::new(parameters.matcher, parameters.resolution);
-    let mut field = TileMap::new();
+    let mut field = LikelihoodField::new();
     let mut occupancy = OccupancyMap::new(parameters.resolution);
     let prepare = |sweep: &Sweep| {
         let Sweep { scan, odom_from_base, .. } = sweep;
@@ -142,7 +142,7 @@ fn resample(bencher: Bencher<'_, '_>, particles: usize) {
     bencher.bench_local(|| {
         let weights = normalize(black_box(&log_weights));
         let ancestors = systematic(&weights, 0.5);
-        let maps: Vec<TileMap<u8>> = ancestors.iter().map(|_| field.clone()).collect();
+        let maps: Vec<LikelihoodField> = ancestors.iter().map(|_| field.clone()).collect();
         (effective_sample_size(&weights), maps)
     });
 }

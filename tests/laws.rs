@@ -13,11 +13,13 @@ use gmapd::slam::gmapping::scan_matcher::FieldMatcher;
 use gmapd::slam::gmapping::{GMapping, MatcherParameters, Parameters, ScanReading, ScanUpdate};
 use gmapd::slam::grid::Cell;
 use gmapd::slam::grid::hit_map::HitMap;
-use gmapd::slam::grid::likelihood_field::{Kernel, Points, Window, WindowPose};
+use gmapd::slam::grid::likelihood_field::{
+    FULL, Kernel, LikelihoodField, Points, Window, WindowPose,
+};
 use gmapd::slam::grid::occupancy::{
     BeamEnd, BeamEndKind, Count, OccupancyGrid, OccupancyMap, ScanOutline,
 };
-use gmapd::slam::grid::tile_map::{TILE_SIZE, TileMap};
+use gmapd::slam::grid::tile_map::TILE_SIZE;
 use gmapd::slam::motion_gate::MotionGate;
 use gmapd::slam::path::Path;
 use gmapd::slam::pose::{Point2, Pose2};
@@ -48,8 +50,8 @@ fn cells() -> impl Strategy<Value = Cell> {
 }
 
 /// A field with these hits around `centre`, of a width of some cells so that it is smooth.
-fn field(centre: Cell, hits: &[(f64, f64)]) -> TileMap<u8> {
-    let mut field = TileMap::new();
+fn field(centre: Cell, hits: &[(f64, f64)]) -> LikelihoodField {
+    let mut field = LikelihoodField::new();
     let hits: Points = hits.iter().map(|(x, y)| (*x as f32, *y as f32)).collect();
     Kernel::new(2.5).insert(&mut field, centre, &hits, WindowPose::new(0.0, 0.0, 0.0));
     field
@@ -84,18 +86,18 @@ fn keep(points: &Points, wanted: &[bool]) -> Points {
 }
 
 /// The bilinear interpolation between cell centres, cell by cell.
-fn interpolated(field: &TileMap<u8>, [x, y]: [f64; 2]) -> f64 {
+fn interpolated(field: &LikelihoodField, [x, y]: [f64; 2]) -> f64 {
     let (column, row) = ((x - 0.5).floor(), (y - 0.5).floor());
     let (fx, fy) = (x - 0.5 - column, y - 0.5 - row);
     let at = |dx: i32, dy: i32| {
-        f64::from(field.get(Cell::new(column as i32 + dx, row as i32 + dy))) / 255.0
+        f64::from(field.get(Cell::new(column as i32 + dx, row as i32 + dy))) / f64::from(FULL)
     };
     let below = at(0, 0) + fx * (at(1, 0) - at(0, 0));
     let above = at(0, 1) + fx * (at(1, 1) - at(0, 1));
     below + fy * (above - below)
 }
 
-fn cost(field: &TileMap<u8>, places: &[[f64; 2]]) -> f64 {
+fn cost(field: &LikelihoodField, places: &[[f64; 2]]) -> f64 {
     places.iter().map(|place| 1.0 - interpolated(field, *place)).map(|e| e * e).sum()
 }
 
@@ -103,14 +105,11 @@ proptest! {
     #[test]
     fn the_score_kernel_equals_its_scalar_twin(
         centre in cells(),
-        values in vec((-110..110, -110..110, 1_u8..), 0..400),
+        hits in vec((-110.0..110.0, -110.0..110.0), 0..400),
         points in points(),
         offset in offsets(),
     ) {
-        let mut field = TileMap::new();
-        for (dx, dy, value) in values {
-            *field.get_mut(Cell::new(centre.ix + dx, centre.iy + dy)) = value;
-        }
+        let field = field(centre, &hits);
         let clear: Vec<bool> =
             places(&points, centre, offset).into_iter().map(|p| !on_a_line(p, 0.0)).collect();
         let points = keep(&points, &clear);
@@ -353,6 +352,7 @@ fn the_incremental_map_equals_the_map_rebuilt_from_the_trajectory() {
     let gate = MotionGate { linear_update: 0.3, angular_update: 0.3, ..MotionGate::default() };
     let mut parameters = Parameters { gate, ..Parameters::default() };
     parameters.weighting.resample_threshold = 0.9;
+    parameters.weighting.flatness = 1.0;
     let mut filter = filter(&parameters);
     let (mut outlines, mut resampled, mut rewritten) = (Vec::new(), 0, 0);
     let mut before = Path::default();
@@ -385,7 +385,7 @@ fn the_field_matcher_agrees_with_the_original_matcher() {
     let resolution = parameters.resolution;
     let field_matcher = FieldMatcher::new(MatcherParameters::default(), resolution);
     let compat_matcher = CompatMatcher::new(MatcherParameters::default(), resolution);
-    let (mut field, mut hits) = (TileMap::new(), HitMap::new());
+    let (mut field, mut hits) = (LikelihoodField::new(), HitMap::new());
     let (mut distance, mut angle, mut matched) = (0.0, 0.0, 0.0);
     // Every fifth reading: 0.4 m of way.
     for (index, reading) in noisy_run(6).readings().step_by(5).take(120).enumerate() {

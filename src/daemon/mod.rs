@@ -3,6 +3,7 @@
 //! What comes is handed on by Zenoh's callbacks ([`input`]), decoded by a task, and put in the
 //! [`mailbox`] of the filter's thread ([`mapper`]), which puts it in order ([`synchronizer`]),
 //! runs the filter, and leaves a [`snapshot`] and an entry in the [`ledger`] for each scan.
+//! From these [`serving`] publishes and answers.
 
 mod answers;
 pub mod command;
@@ -26,6 +27,7 @@ pub mod status;
 pub mod synchronizer;
 
 use std::future::Future;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -44,12 +46,12 @@ use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
-use self::save::{NameError, SaveError, SaveName, Saver};
-use self::serving::{Serving, ServingError};
+use self::save::{NameError, SaveName, Saver};
+use self::serving::{Serving, ServingError, Sources};
 use self::snapshot::{MapVersion, Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
-use crate::config::{Config, RawConfig};
+use crate::config::Config;
 use crate::slam::gmapping::ThreadsError;
 
 /// At the end, what waits in the mailbox is worked off for this long.
@@ -87,18 +89,18 @@ pub enum DaemonError {
     /// A key cannot be used.
     #[error(transparent)]
     Key(#[from] KeyError),
+    /// `save_on_exit` is not a name.
+    #[error("save_on_exit: {0}")]
+    SaveName(#[from] NameError),
+    /// Nothing can be published or answered.
+    #[error(transparent)]
+    Serving(#[from] ServingError),
     /// The filter's threads do not start.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
     /// The thread `mapper` does not start.
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
-    /// No map can be saved as `save_on_exit` says.
-    #[error("save_on_exit: {0}")]
-    SaveOnExit(#[from] NameError),
-    /// Nothing can be published or answered.
-    #[error(transparent)]
-    Serving(#[from] ServingError),
     /// Zenoh takes no subscriber.
     #[error("cannot subscribe to {key}: {reason}")]
     Subscribe {
@@ -147,39 +149,18 @@ pub struct Daemon {
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
     status: Arc<StatusSource>,
-    /// `None` before it has started and after it has stopped.
+    /// `None` before it has started and once stopped.
     serving: Option<Serving>,
+    saving: Saving,
     helpers: [JoinHandle<()>; 2],
-    last_save: Option<LastSave>,
 }
 
-/// What `save_on_exit` asks for.
-#[derive(Debug)]
-struct LastSave {
-    name: SaveName,
-    saver: Saver,
+/// What is saved at the end.
+#[derive(Debug, Clone)]
+struct Saving {
+    name: Option<SaveName>,
+    directory: PathBuf,
     empty: EmptyMap,
-}
-
-impl LastSave {
-    fn of(config: &RawConfig) -> Result<Option<Self>, NameError> {
-        let Some(name) = &config.save_on_exit else { return Ok(None) };
-        let (frame, resolution) = (config.map_frame.clone(), config.resolution);
-        Ok(Some(Self {
-            name: SaveName::parse(name)?,
-            saver: Saver::new(config.save_directory.clone().into()),
-            empty: EmptyMap { frame, resolution },
-        }))
-    }
-
-    /// Saves the map, if there is one.
-    fn save(self, map: Option<Arc<MapVersion>>) {
-        match self.saver.save(&self.name, &MapProducts::new(map, self.empty)) {
-            Ok(saved) => tracing::info!("{}", saved.done),
-            Err(SaveError::NoMap) => tracing::info!("there is no map to save"),
-            Err(error) => tracing::error!("the map is not saved: {error}"),
-        }
-    }
 }
 
 #[derive(Debug)]
@@ -197,14 +178,13 @@ impl Daemon {
         let Settings { config, prefix, threads } = settings;
         let keys = InputKeys::new(&prefix, &config.raw.keys)?;
         let mut daemon = Self::deaf(&config, &keys, threads)?;
-        let status = Arc::clone(&daemon.status);
-        let sources = serving::Sources {
+        let sources = Sources {
             snapshots: daemon.snapshots(),
             verdicts: daemon.verdicts(),
             commands: daemon.commands(),
-            status: serving::AskStatus::new(move || status.status()),
+            status: asked(&daemon.status),
         };
-        let served = serving::Settings::new(&config, config.raw.save_directory.clone().into());
+        let served = serving::Settings::new(&config, daemon.saving.directory());
         daemon.serving = Some(Serving::start(session, &prefix, served, sources).await?);
         daemon.subscribers = Some(subscribe(session, &keys, &daemon.inbox).await?);
         tell_keys(&keys);
@@ -213,7 +193,7 @@ impl Daemon {
 
     /// All threads and tasks of a daemon that hears and tells nothing yet.
     fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
-        let last_save = LastSave::of(&config.raw)?;
+        let saving = Saving::new(config)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
@@ -251,8 +231,8 @@ impl Daemon {
             commands,
             status,
             serving: None,
+            saving,
             helpers,
-            last_save,
         })
     }
 
@@ -286,8 +266,7 @@ impl Daemon {
         (&mut self.mapper).await.ok();
     }
 
-    /// Stops listening, works off what waits for a while, saves the map if that is configured, and
-    /// leaves the last snapshot.
+    /// Stops listening, works off what waits for a while, and leaves the last snapshot.
     pub async fn stop(mut self) -> Arc<Snapshot> {
         let deadline = clock::now() + DRAIN;
         if let Some(subscribers) = self.subscribers.take() {
@@ -303,14 +282,13 @@ impl Daemon {
         }
         self.helpers.iter().for_each(JoinHandle::abort);
         let last = self.snapshots.borrow().clone();
-        let map = last.map.clone();
-        let saving = self.last_save.take().map(|save| spawn_blocking(move || save.save(map)));
+        let (saving, map) = (self.saving.clone(), last.map.clone());
+        let saved = spawn_blocking(move || saving.save(map));
         if let Some(serving) = self.serving.take() {
             tokio::time::timeout(CLOSE, serving.stop()).await.ok();
         }
-        if let Some(saving) = saving {
-            saving.await.ok();
-        }
+        // It panics for a bug alone, which is told already.
+        saved.await.ok();
         last
     }
 }
@@ -321,6 +299,31 @@ impl Drop for Daemon {
         self.inbox.close();
         self.mailbox.close(clock::now());
         self.helpers.iter().for_each(JoinHandle::abort);
+    }
+}
+
+impl Saving {
+    fn new(config: &Config) -> Result<Self, NameError> {
+        let raw = &config.raw;
+        Ok(Self {
+            name: raw.save_on_exit.as_deref().map(SaveName::parse).transpose()?,
+            directory: PathBuf::from(&raw.save_directory),
+            empty: EmptyMap { frame: raw.map_frame.clone(), resolution: raw.resolution },
+        })
+    }
+
+    fn directory(&self) -> PathBuf {
+        self.directory.clone()
+    }
+
+    /// Saves the last map, if the configuration asks for it and there is one.
+    fn save(self, map: Option<Arc<MapVersion>>) {
+        let Some(name) = &self.name else { return };
+        let products = MapProducts::new(map, self.empty);
+        match Saver::new(self.directory).save(name, &products) {
+            Ok(saved) => tracing::info!("{}", saved.done),
+            Err(error) => tracing::error!("the last map is not saved: {error}"),
+        }
     }
 }
 
@@ -375,6 +378,12 @@ async fn subscribe(
         .await
         .map_err(failed(Input::TfStatic))?;
     Ok(Subscribers { changing, constant })
+}
+
+/// The status as those ask for it that serve it.
+fn asked(status: &Arc<StatusSource>) -> serving::AskStatus {
+    let status = Arc::clone(status);
+    serving::AskStatus::new(move || status.status())
 }
 
 fn tell_keys(keys: &InputKeys) {

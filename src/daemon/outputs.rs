@@ -33,6 +33,10 @@ use crate::convert;
 use crate::ros;
 use crate::slam::pose::Pose2;
 
+/// How often it is looked whether somebody takes the map, beside being told: who leaves and comes
+/// back at once may not be told of.
+const LOOK: Duration = Duration::from_secs(1);
+
 /// How soon a subscriber that missed the last map hears that there is one.
 const HEARTBEAT: Duration = Duration::from_millis(500);
 
@@ -248,14 +252,17 @@ impl RetainedOutput {
             }
             let snapshot = snapshots.borrow_and_update().clone();
             let Some(newest) = &snapshot.map else { continue };
-            if resting || newest.version == version || !self.is_wanted().await {
+            if resting || newest.version == version {
                 continue;
             }
-            version = newest.version;
-            let products = self.products.of(Some(newest));
-            content = self.put(products, content).await;
             resting = true;
-            rest.set(tokio::time::sleep(self.interval));
+            if self.is_wanted().await {
+                version = newest.version;
+                content = self.put(self.products.of(Some(newest)), content).await;
+                rest.set(tokio::time::sleep(self.interval));
+            } else {
+                rest.set(tokio::time::sleep(LOOK));
+            }
         }
     }
 

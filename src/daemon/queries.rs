@@ -22,7 +22,10 @@ const ANSWERS_AT_ONCE: usize = 64;
 const COMMANDS_AT_ONCE: usize = 8;
 
 /// Queries beyond those that wait to hear that they are too many; more end without a reply.
-const REFUSALS_WAITING: usize = 256;
+const REFUSALS_WAITING: usize = 1024;
+
+/// Bytes of parameters that a query may have to wait for that.
+const LONGEST_WAITING: usize = 1024;
 
 /// What a robot answers, while this lives.
 #[derive(Debug)]
@@ -102,7 +105,8 @@ impl Counter {
         }
         let places = if topic.is_command() { &self.commands } else { &self.answers };
         let Ok(place) = places.clone().try_acquire_owned() else {
-            if self.refused.try_send(query).is_err() {
+            let may_wait = query.parameters().as_str().len() <= LONGEST_WAITING;
+            if !may_wait || self.refused.try_send(query).is_err() {
                 tracing::debug!(%key, "a query ends without a reply: too many come at once");
             }
             return;

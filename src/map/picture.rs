@@ -1,6 +1,6 @@
 //! `map.png`: the map as people want to look at it, with the way the robot took.
 
-use super::bounds::known_bounds;
+use super::bounds::shown_bounds;
 use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::Point2;
 
@@ -25,7 +25,7 @@ const END: u8 = 5;
 const PALETTE: [[u8; 3]; 6] =
     [[205, 208, 211], [255, 255, 255], [28, 32, 38], [38, 119, 201], [34, 160, 84], [212, 52, 52]];
 
-/// The map as an 8-bit RGB PNG, cropped to what is known, with `path_in_map` from its green start
+/// The map as an 8-bit RGB PNG, cropped to free space, with `path_in_map` from its green start
 /// to its red end.
 ///
 /// # Errors
@@ -51,7 +51,7 @@ struct Canvas {
 
 impl Canvas {
     fn of_map(grid: &OccupancyGrid) -> Self {
-        let [columns, rows] = known_bounds(grid);
+        let [columns, rows] = shown_bounds(grid);
         let longer = columns.len().max(rows.len()) + 2 * MARGIN;
         let scale = COMFORTABLE_SIDE.div_ceil(longer).clamp(1, LARGEST_SCALE);
         let mut canvas = Self {

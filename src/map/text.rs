@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::num::NonZeroUsize;
 use std::ops::Range;
 
-use super::bounds::known_bounds;
+use super::bounds::shown_bounds;
 use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::pose::Pose2;
 
@@ -31,7 +31,7 @@ const ROBOT: [char; 8] = ['→', '↗', '↑', '↖', '←', '↙', '↓', '↘'
 /// obstacles is free if any of it is.
 #[must_use]
 pub fn text(grid: &OccupancyGrid, columns: NonZeroUsize, robot_in_map: Option<Pose2>) -> String {
-    let [known_columns, known_rows] = known_bounds(grid);
+    let [known_columns, known_rows] = shown_bounds(grid);
     if known_columns.is_empty() {
         return "nothing is known yet\n".to_owned();
     }

@@ -4,33 +4,73 @@ use std::sync::Arc;
 
 use super::pose::{Pose2, Stamp};
 
-/// The pose of the base in `map` at each processed scan, oldest first; cheap to copy.
+/// Poses that copies of a path share as one.
+const CHUNK: usize = 256;
+
+/// The pose of the base in `map` at each processed scan, oldest first.
+///
+/// A copy shares all but the last poses with its original, so that it costs little however long
+/// the way is.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Path {
-    poses: Arc<Vec<(Stamp, Pose2)>>,
+    chunks: Vec<Arc<[(Stamp, Pose2)]>>,
+    /// Fewer than a chunk.
+    last: Vec<(Stamp, Pose2)>,
 }
 
 impl Path {
     /// How many poses there are.
     #[must_use]
-    pub fn len(&self) -> usize {
-        self.poses.len()
+    pub const fn len(&self) -> usize {
+        self.chunks.len() * CHUNK + self.last.len()
     }
 
     /// Whether no scan has been processed.
     #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.poses.is_empty()
+    pub const fn is_empty(&self) -> bool {
+        self.len() == 0
     }
 
     /// The poses, oldest first.
     pub fn iter(&self) -> impl DoubleEndedIterator<Item = (Stamp, Pose2)> {
-        self.poses.iter().copied()
+        self.chunks.iter().flat_map(|chunk| chunk.iter()).chain(&self.last).copied()
+    }
+
+    /// Adds the pose at the next scan.
+    pub fn push(&mut self, stamp: Stamp, pose_in_map: Pose2) {
+        self.last.push((stamp, pose_in_map));
+        if self.last.len() == CHUNK {
+            self.chunks.push(self.last.drain(..).collect());
+        }
     }
 }
 
 impl FromIterator<(Stamp, Pose2)> for Path {
     fn from_iter<I: IntoIterator<Item = (Stamp, Pose2)>>(poses: I) -> Self {
-        Self { poses: Arc::new(poses.into_iter().collect()) }
+        let mut path = Self::default();
+        poses.into_iter().for_each(|(stamp, pose_in_map)| path.push(stamp, pose_in_map));
+        path
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_stay_in_order_and_copies_do_not_follow() {
+        let pose = |i: usize| (Stamp(i as i64), Pose2::new(i as f64, 0.0, 0.0));
+        let mut path = Path::default();
+        let mut copies = Vec::new();
+        for i in 0..3 * CHUNK {
+            copies.push(path.clone());
+            let (stamp, pose_in_map) = pose(i);
+            path.push(stamp, pose_in_map);
+        }
+        for (length, copy) in copies.iter().enumerate().step_by(97) {
+            assert_eq!((copy.len(), copy.is_empty()), (length, length == 0));
+            assert!(copy.iter().eq((0..length).map(pose)));
+        }
+        assert!(path.iter().rev().eq((0..3 * CHUNK).rev().map(pose)));
     }
 }

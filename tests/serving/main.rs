@@ -448,8 +448,16 @@ async fn maps_keep_their_distance_and_who_comes_anew_does_not_wait() {
     }
     leave(&rig, vec![first]).await;
     assert!(maps.try_recv().is_err(), "the hour has not passed");
-    let (_second, mut maps) = late_joiner(&rig.client, "map").await;
-    until_map_of(&mut maps, &drive[5]).await;
+    // Who comes in the moment the other leaves may look like the same: then once more.
+    for _ in 0..20 {
+        let (second, mut maps) = late_joiner(&rig.client, "map").await;
+        let newest = until_map_of(&mut maps, &drive[5]);
+        if tokio::time::timeout(Duration::from_secs(1), newest).await.is_ok() {
+            return;
+        }
+        leave(&rig, vec![second]).await;
+    }
+    panic!("who comes anew waits for the hour to pass");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -459,8 +467,6 @@ async fn poses_particles_and_entropy_come_with_each_scan() {
     let mut poses = rig.subscribe("pose").await;
     let mut clouds = rig.subscribe("particlecloud").await;
     let mut entropies = rig.subscribe("entropy").await;
-    // The subscriptions are known to the daemon before the answer to a later question is.
-    rig.ask("slam/status").await.unwrap();
     for snapshot in &drive[5..8] {
         rig.show(snapshot);
         let estimate = &snapshot.estimate;
@@ -515,7 +521,6 @@ async fn diagnostics_tell_the_state() {
 async fn the_newest_verdict_arrives_however_many_there_are() {
     let rig = Rig::start(nothing()).await;
     let mut verdicts = rig.subscribe("slam/verdict").await;
-    rig.ask("slam/status").await.unwrap();
     for number in 1..=500 {
         let entry = Entry {
             number,

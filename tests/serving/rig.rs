@@ -218,6 +218,8 @@ impl Rig {
             .background()
             .await
             .expect("it is a key");
+        // The daemon's side hears of the subscription before it hears a later question.
+        self.ask("slam/status").await.expect("it is answered");
         receiver
     }
 }

@@ -14,6 +14,8 @@ pub mod resampling;
 pub mod scan_matcher;
 pub mod trajectory;
 
+use std::collections::{BTreeMap, VecDeque};
+
 use nalgebra::Matrix3;
 use rayon::iter::{
     IndexedParallelIterator as _, IntoParallelRefMutIterator as _, ParallelIterator as _,
@@ -28,7 +30,7 @@ use self::prepared_scan::PreparedScan;
 use self::random::{Purpose, Streams};
 pub use self::resampling::{WeightSmoothing, Weighting};
 pub use self::scan_matcher::{MatcherKind, MatcherParameters};
-use self::trajectory::TrajectoryTree;
+use self::trajectory::{NodeId, TrajectoryTree};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
 use super::odometry::Motion;
@@ -127,6 +129,13 @@ pub struct ThreadsError {
     source: rayon::ThreadPoolBuildError,
 }
 
+/// Processed scans after which a trajectory is not disputed any more: loops up to this length
+/// are closed by a choice among whole trajectories.
+///
+/// Then only particles that have the best one's past are drawn. It bounds the memory of particles
+/// that are hardly ever drawn anew, and what the output map does when the best particle changes.
+const HISTORY: u32 = 400;
+
 /// The filter.
 #[derive(Debug)]
 pub struct GMapping {
@@ -142,8 +151,10 @@ pub struct GMapping {
     tree: TrajectoryTree,
     output: OutputMap,
     odometry: Odometry,
-    /// Of the processed scans.
-    stamps: Vec<Stamp>,
+    /// The beginning of all particles' trajectories, which is in the tree no more.
+    settled: Path,
+    /// Of the processed scans after those.
+    stamps: VecDeque<Stamp>,
     scans_seen: usize,
 }
 
@@ -172,7 +183,8 @@ impl GMapping {
             tree: TrajectoryTree::default(),
             output: OutputMap::new(parameters.resolution),
             odometry: Odometry::default(),
-            stamps: Vec::new(),
+            settled: Path::default(),
+            stamps: VecDeque::new(),
             scans_seen: 0,
             parameters,
         })
@@ -233,7 +245,7 @@ impl GMapping {
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
         let motion = std::mem::take(&mut self.odometry.since_processed);
-        self.stamps.push(reading.scan.stamp);
+        self.stamps.push_back(reading.scan.stamp);
         if self.particles.is_empty() {
             self.begin(reading.odom_from_base);
         } else {
@@ -246,7 +258,7 @@ impl GMapping {
         on_phase(Phase::Register);
         self.update_output(scan);
         if report.resampled || self.particles.len() == 1 {
-            self.output.forget_agreed(&self.tree, self.particles.iter().map(|p| p.node));
+            self.settle();
         }
         on_phase(Phase::Map);
         ScanUpdate::Processed(report)
@@ -261,7 +273,7 @@ impl GMapping {
         if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans.max(1)) {
             return Err(SkipReason::Throttled);
         }
-        let elapsed = self.stamps.last().map(|last| reading.scan.stamp.seconds_since(*last));
+        let elapsed = self.stamps.back().map(|last| reading.scan.stamp.seconds_since(*last));
         if !self.parameters.gate.opens(&self.odometry.since_processed, elapsed) {
             return Err(SkipReason::NotMovedEnough);
         }
@@ -285,7 +297,7 @@ impl GMapping {
             noise: self.parameters.motion_noise,
             weight_gain: self.parameters.weighting.gain(self.particles.len(), scan.hits.len()),
             minimum_score: self.parameters.matcher.minimum_score,
-            number: self.stamps.len() as u64,
+            number: self.processed(),
         };
         let (matcher, streams) = (&self.matcher, &self.streams);
         for_each(self.pool.as_ref(), &mut self.particles, |index, particle| {
@@ -303,16 +315,19 @@ impl GMapping {
         let weights = self.weights();
         let effective_sample_size = resampling::effective_sample_size(&weights);
         let threshold = self.parameters.weighting.resample_threshold * weights.len() as f64;
+        let disputed = self.stamps.len() as u32;
         let report = ScanReport {
             hits,
             matched: self.particles.iter().filter(|particle| particle.matched).count(),
             best_score: self.best().map_or(0.0, |particle| particle.score),
             effective_sample_size,
             entropy: resampling::entropy(&weights),
-            resampled: effective_sample_size < threshold,
+            resampled: effective_sample_size < threshold || disputed > HISTORY + HISTORY / 4,
         };
         if report.resampled {
-            let number = self.stamps.len() as u64;
+            let weights =
+                if disputed > HISTORY { self.weights_of_likeliest_past(&weights) } else { weights };
+            let number = self.processed();
             let uniform = self.streams.uniform(Purpose::Resampling, number, 0);
             let ancestors = resampling::systematic(&weights, uniform);
             let before = std::mem::take(&mut self.particles);
@@ -338,6 +353,42 @@ impl GMapping {
     fn update_output(&mut self, scan: PreparedScan) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
         self.output.extend(&mut self.tree, best, scan.outline);
+    }
+
+    /// The weights of the particles that share the likeliest trajectory up to [`HISTORY`] scans
+    /// ago; zero for all others.
+    fn weights_of_likeliest_past(&self, weights: &[f64]) -> Vec<f64> {
+        let depth = |particle: &Particle| self.tree.depth(particle.node).saturating_sub(HISTORY);
+        let past = |particle: &Particle| self.tree.ancestor_at(particle.node, depth(particle));
+        let pasts: Vec<NodeId> = self.particles.iter().map(past).collect();
+        let mut likelihoods = BTreeMap::<NodeId, f64>::new();
+        for (past, weight) in pasts.iter().zip(weights) {
+            *likelihoods.entry(*past).or_default() += weight;
+        }
+        let likelier =
+            |a: &(NodeId, f64), b: &(NodeId, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
+        let likeliest = likelihoods.into_iter().max_by(likelier);
+        let Some((likeliest, likelihood)) = likeliest else { return weights.to_vec() };
+        let share = |(past, weight): (&NodeId, &f64)| {
+            if *past == likeliest { weight / likelihood } else { 0.0 }
+        };
+        pasts.iter().zip(weights).map(share).collect()
+    }
+
+    /// Takes the beginning that all trajectories share out of the tree.
+    fn settle(&mut self) {
+        let mut nodes = self.particles.iter().map(|particle| particle.node);
+        let Some(first) = nodes.next() else { return };
+        let Some(root) = nodes.try_fold(first, |a, b| self.tree.common_ancestor(a, b)) else {
+            return;
+        };
+        let settled: Vec<Pose2> =
+            self.tree.ancestry(root).skip(1).map(|node| self.tree.pose(node)).collect();
+        for (pose, stamp) in settled.iter().rev().zip(self.stamps.drain(..settled.len())) {
+            self.settled.push(stamp, *pose);
+        }
+        self.tree.cut_above(root);
+        self.output.forget(self.tree.depth(root));
     }
 
     /// Index of the particle with the largest weight since the start; the first of equals.
@@ -414,7 +465,9 @@ impl GMapping {
         let Some(best) = self.best() else { return Path::default() };
         let poses: Vec<Pose2> =
             self.tree.ancestry(best.node).map(|node| self.tree.pose(node)).collect();
-        self.stamps.iter().copied().zip(poses.into_iter().rev()).collect()
+        let mut path = self.settled.clone();
+        self.stamps.iter().zip(poses.iter().rev()).for_each(|(&at, &pose)| path.push(at, pose));
+        path
     }
 
     /// Hits and visits of each cell, along the best particle's trajectory.
@@ -433,12 +486,19 @@ impl GMapping {
     #[must_use]
     pub fn particle_tiles(&self) -> TileCounts {
         match self.matcher {
-            ScanMatcher::Field(_) => TileCounts::of(self.particles.iter().map(|p| &p.map.field)),
+            ScanMatcher::Field(_) => {
+                TileCounts::of(self.particles.iter().map(|p| p.map.field.tiles()))
+            }
             ScanMatcher::Compat(_) => TileCounts::of(self.particles.iter().map(|p| &p.map.hits)),
         }
     }
 
-    /// Nodes of the trajectory tree.
+    /// How many scans have been processed.
+    fn processed(&self) -> u64 {
+        (self.settled.len() + self.stamps.len()) as u64
+    }
+
+    /// Nodes of the trajectory tree: at most a few hundred a particle, however long the run.
     #[must_use]
     pub fn trajectory_nodes(&self) -> usize {
         self.tree.len()

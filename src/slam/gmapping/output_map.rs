@@ -14,7 +14,7 @@ pub struct OutputMap {
     map: OccupancyMap,
     /// Held in the tree.
     node: Option<NodeId>,
-    /// Scans that living particles place differently; the first belongs to depth `first_depth`.
+    /// Scans that particles may still place differently; the first belongs to `first_depth`.
     scans: VecDeque<ScanOutline>,
     first_depth: u32,
 }
@@ -52,11 +52,9 @@ impl OutputMap {
         }
     }
 
-    /// Forgets the scans that all trajectories ending at `leaves` place alike.
-    pub fn forget_agreed(&mut self, tree: &TrajectoryTree, leaves: impl Iterator<Item = NodeId>) {
-        let shared = leaves.fold(self.node, |shared, leaf| tree.common_ancestor(shared?, leaf));
-        let agreed = shared.map_or(0, |id| tree.depth(id) + 1);
-        while self.first_depth < agreed {
+    /// Forgets the scans up to `depth`: no trajectory will place them otherwise.
+    pub fn forget(&mut self, depth: u32) {
+        while self.first_depth <= depth {
             self.scans.pop_front();
             self.first_depth += 1;
         }
@@ -69,6 +67,7 @@ mod tests {
 
     use super::super::super::grid::Cell;
     use super::super::super::grid::occupancy::{BeamEnd, BeamEndKind, Count};
+    use super::super::super::grid::tile_map::TILE_SIZE;
     use super::super::super::pose::{Point2, Pose2};
     use super::*;
 
@@ -85,12 +84,14 @@ mod tests {
         ScanOutline { sensor: Point2::new(0.1, -0.05), ends: ends.collect(), angle_increment: 0.2 }
     }
 
+    const SIZE: i32 = TILE_SIZE as i32;
+
     fn seen(map: &OccupancyMap) -> Vec<(Cell, Count)> {
         let tiles = map.counts().tiles();
         let cells = tiles.flat_map(|(key, tile)| {
             tile.iter().enumerate().map(move |(i, count)| {
                 let first = key.first_cell();
-                (Cell::new(first.ix + i as i32 % 32, first.iy + i as i32 / 32), *count)
+                (Cell::new(first.ix + i as i32 % SIZE, first.iy + i as i32 / SIZE), *count)
             })
         });
         let mut cells: Vec<_> = cells.filter(|(_, c)| *c != Count::default()).collect();
@@ -118,7 +119,12 @@ mod tests {
                 leaves = grown.map(Some);
                 scans.push(scan(1.0 + i as f32 * 0.1));
                 output.extend(&mut tree, grown[best], scans[i].clone());
-                output.forget_agreed(&tree, grown.into_iter());
+                let shared = grown[1..]
+                    .iter()
+                    .try_fold(grown[0], |shared, leaf| tree.common_ancestor(shared, *leaf));
+                if let Some(shared) = shared {
+                    output.forget(tree.depth(shared));
+                }
 
                 let mut anew = OccupancyMap::new(0.1);
                 for id in tree.ancestry(grown[best]) {
@@ -130,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn agreed_scans_are_forgotten() {
+    fn settled_scans_are_forgotten() {
         let mut tree = TrajectoryTree::default();
         let mut output = OutputMap::new(0.1);
         let mut leaf = None;
@@ -140,7 +146,7 @@ mod tests {
             leaf = Some(node);
         }
         assert_eq!(output.scans.len(), 10);
-        output.forget_agreed(&tree, leaf.into_iter());
-        assert_eq!(output.scans.len(), 0);
+        output.forget(7);
+        assert_eq!(output.scans.len(), 2);
     }
 }

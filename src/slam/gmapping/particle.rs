@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 
 use super::super::grid::hit_map::HitMap;
-use super::super::grid::tile_map::TileMap;
+use super::super::grid::likelihood_field::LikelihoodField;
 use super::super::odometry::{Motion, MotionNoise};
 use super::super::pose::{Pose2, wrap_angle};
 use super::compat::CompatMatcher;
@@ -40,7 +40,7 @@ pub struct Particle {
 /// The map of a particle, as its matcher wants it; the other one stays empty.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ParticleMap {
-    pub(super) field: TileMap<u8>,
+    pub(super) field: LikelihoodField,
     pub(super) hits: HitMap,
 }
 

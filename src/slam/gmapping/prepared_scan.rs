@@ -6,6 +6,8 @@ use super::super::pose::Point2;
 use super::super::scan::Beam;
 use super::{Parameters, ScanReading};
 
+/// Of the hits, the climb looks at every second.
+const COARSE_STEP: usize = 2;
 /// Hits further away than this cannot be looked up, cells.
 const MAX_RADIUS: f64 = 16_000.0;
 /// Neighbouring hits lie on one surface if they are at most this far apart, m, ...
@@ -20,6 +22,8 @@ const SURFACE_SPACING: f64 = 0.8;
 pub struct PreparedScan {
     /// Hits to match, in the base frame, cells.
     pub hits: Points,
+    /// Some of them, for the climb.
+    pub coarse_hits: Points,
     /// Points of the surfaces that were seen: the hits, and points between neighbouring hits.
     ///
     /// Far away and at a slant, hits are further apart than the matcher's reach; a map of such
@@ -47,6 +51,7 @@ impl PreparedScan {
         let radius = hits.iter().map(|(x, y)| (x * x + y * y).sqrt()).fold(0.0, f32::max);
         let widest = SURFACE_GAP / resolution;
         Self {
+            coarse_hits: hits.every(COARSE_STEP),
             hits,
             surfaces: surfaces(&ends, widest, SURFACE_SLANT * outline.angle_increment),
             radius: radius as i32 + 1,

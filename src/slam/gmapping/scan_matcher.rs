@@ -3,15 +3,14 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::super::grid::Cell;
-use super::super::grid::likelihood_field::{Kernel, Linearization, Points, Window, WindowPose};
-use super::super::grid::tile_map::TileMap;
+use super::super::grid::likelihood_field::{
+    FULL, Kernel, LikelihoodField, Linearization, Points, Window, WindowPose,
+};
 use super::super::pose::{Pose2, wrap_angle};
 use super::prepared_scan::PreparedScan;
 
 /// Cells a match may move along an axis; the window is that much larger than the scan.
 const REACH: f64 = 40.0;
-/// Beams looked at by the climb: every second.
-const COARSE_STEP: usize = 2;
 /// Headings tried around the start before the climb, each way, and the angle between them, rad.
 const SWEEP: (i32, f64) = (4, 0.1);
 /// Step lengths of the climb, each half the one before.
@@ -24,8 +23,8 @@ const CONVERGED: (f64, f64) = (0.02, 0.0004);
 /// The share of beams that are expected to end on what the map knows (Thrun, Burgard, Fox:
 /// Probabilistic Robotics, table 6.3, z_hit).
 const HIT_SHARE: f64 = 0.9;
-/// Beams with at least this field value take part in the estimate of the residual's variance.
-const MATCHED: u8 = 40;
+/// Beams with at least this level of the field take part in the estimate of the residual's variance.
+const MATCHED: u8 = 3;
 
 /// The scan matcher's settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -98,15 +97,15 @@ pub struct FieldMatcher {
     parameters: MatcherParameters,
     resolution: f64,
     kernel: Kernel,
-    log_likelihoods: [f64; 256],
+    log_likelihoods: [f64; FULL as usize + 1],
 }
 
 impl FieldMatcher {
     /// A matcher for fields of cells of `resolution` metres.
     #[must_use]
     pub fn new(parameters: MatcherParameters, resolution: f64) -> Self {
-        let log_likelihood = |byte: usize| {
-            let hit = byte as f64 / 255.0;
+        let log_likelihood = |level: usize| {
+            let hit = level as f64 / f64::from(FULL);
             libm::log(HIT_SHARE * hit + (1.0 - HIT_SHARE))
         };
         Self {
@@ -119,7 +118,7 @@ impl FieldMatcher {
 
     /// Matches a scan against `field`, starting with the base at `start`.
     #[must_use]
-    pub fn run(&self, field: &TileMap<u8>, scan: &PreparedScan, start: Pose2) -> Match {
+    pub fn run(&self, field: &LikelihoodField, scan: &PreparedScan, start: Pose2) -> Match {
         let centre = Cell::containing(start.position(), self.resolution);
         let window = Window::around(field, centre, scan.radius + REACH as i32 + 2);
         let first = window.first_cell();
@@ -128,7 +127,7 @@ impl FieldMatcher {
             start.y / self.resolution - f64::from(first.iy),
             start.theta,
         );
-        let climbed = self.climb(&window, &scan.hits.every(COARSE_STEP), origin);
+        let climbed = self.climb(&window, &scan.coarse_hits, origin);
         let (pose, fit) = polish(&window, &scan.hits, climbed, origin);
         let Evidence { log_likelihood, residual_variance } = self.evidence(&window, scan, pose);
         Match {
@@ -144,7 +143,7 @@ impl FieldMatcher {
     }
 
     /// Enters a scan taken with the base at `pose` into `field`.
-    pub fn register(&self, field: &mut TileMap<u8>, scan: &PreparedScan, pose: Pose2) {
+    pub fn register(&self, field: &mut LikelihoodField, scan: &PreparedScan, pose: Pose2) {
         let origin = Cell::containing(pose.position(), self.resolution);
         let x = pose.x / self.resolution - f64::from(origin.ix);
         let y = pose.y / self.resolution - f64::from(origin.iy);
@@ -188,10 +187,10 @@ impl FieldMatcher {
     fn evidence(&self, window: &Window<'_>, scan: &PreparedScan, pose: WindowPose) -> Evidence {
         let mut log_likelihood = 0.0;
         let (mut squares, mut matched) = (0.0, 0.0);
-        window.for_each_value(&scan.hits, pose, |value| {
-            log_likelihood += self.log_likelihoods[usize::from(value)];
-            if value >= MATCHED {
-                let residual = 1.0 - f64::from(value) / 255.0;
+        window.for_each_value(&scan.hits, pose, |level| {
+            log_likelihood += self.log_likelihoods[usize::from(level & FULL)];
+            if level >= MATCHED {
+                let residual = 1.0 - f64::from(level) / f64::from(FULL);
                 squares += residual * residual;
                 matched += 1.0;
             }

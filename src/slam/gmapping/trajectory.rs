@@ -92,6 +92,19 @@ impl TrajectoryTree {
         Some(a)
     }
 
+    /// The node's ancestor at `depth`; itself, if it is not that deep or has no such ancestor.
+    #[must_use]
+    pub fn ancestor_at(&self, id: NodeId, depth: u32) -> NodeId {
+        self.ancestry(id).find(|id| self.depth(*id) <= depth).unwrap_or(id)
+    }
+
+    /// Makes a node the root: its ancestors disappear.
+    pub fn cut_above(&mut self, id: NodeId) {
+        if let Some(parent) = self.nodes[id as usize].parent.take() {
+            self.release(parent);
+        }
+    }
+
     /// Nodes in use.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -132,6 +145,20 @@ mod tests {
 
         tree.release(a);
         assert!(tree.is_empty());
+    }
+
+    #[test]
+    fn a_new_root_has_no_ancestors_and_keeps_its_depth() {
+        let mut tree = TrajectoryTree::default();
+        let mut leaf = tree.append(None, pose(0.0));
+        for i in 1..5 {
+            let next = tree.append(Some(leaf), pose(f64::from(i)));
+            tree.release(std::mem::replace(&mut leaf, next));
+        }
+        let root = tree.ancestor_at(leaf, 3);
+        assert_eq!((tree.pose(root).x, tree.ancestor_at(leaf, 9)), (3.0, leaf));
+        tree.cut_above(root);
+        assert_eq!((tree.len(), tree.depth(leaf), tree.ancestor_at(leaf, 0)), (2, 4, leaf));
     }
 
     #[test]

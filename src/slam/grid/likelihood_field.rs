@@ -1,26 +1,74 @@
-//! The likelihood field: for each cell, how near the nearest hit of the map is, as one byte.
+//! The likelihood field: for each cell, how near the nearest hit of the map is, in four bits.
 //!
-//! A byte is `255 * exp(-d^2 / (2 sigma^2))` for the distance d from the cell's centre to the
+//! A cell's level is `15 * exp(-d^2 / (2 sigma^2))` for the distance d from its centre to the
 //! nearest hit. It is kept up to date by stamping a small kernel around each new hit and keeping
 //! the maximum, so that a beam is evaluated with one look-up where the original searched nine
-//! cells and their means.
+//! cells and their means. Sixteen levels match as well as 256 do (`docs/tuning.md`), and fields
+//! are what the particles' memory goes to.
 
+use super::Cell;
 use super::tile_map::{TILE_CELLS, TILE_SIZE, Tile, TileKey, TileMap, index_in_tile};
-use super::{Cell, floor};
+
+/// The level of a cell with a hit in its centre.
+pub const FULL: u8 = 15;
 
 /// Sub-cell positions a kernel is tabulated for, along each axis.
 const PHASES: usize = 8;
-/// A hit that would raise its cell by no more than this is taken for known.
-const KNOWN_WITHIN: u8 = 8;
 /// Beams whose cells are computed together before they are looked up.
 const BLOCK: usize = 64;
 /// Lanes of the floating-point sums; fixed, so that sums are the same on every machine.
 const LANES: usize = 8;
 /// Adding this to a float in (-2^22, 2^22) leaves its nearest integer in the low mantissa bits.
 const ROUND: f32 = 12_582_912.0;
-/// The bits of a column or row that say where in its tile it is.
-const CELL: u32 = TILE_SIZE as u32 - 1;
+/// Tiles are `1 << TILE_COLUMNS` cells wide and `1 << TILE_ROWS` high.
+const TILE_COLUMNS: u32 = TILE_ROWS + 1;
+const TILE_ROWS: u32 = TILE_SIZE.trailing_zeros();
+/// The bits of a column, of a row and of an index that say where in its tile it is.
+const COLUMN: u32 = (1 << TILE_COLUMNS) - 1;
+const ROW: u32 = (1 << TILE_ROWS) - 1;
+const CELL: usize = (1 << (TILE_COLUMNS + TILE_ROWS)) - 1;
+/// Where four levels lie in one word: left, right, left above, right above.
+const CORNERS: [u32; 4] = [0, 4, 16, 20];
 const EMPTY: &Tile<u8> = &[0; TILE_CELLS];
+
+/// The likelihood field of a map. A clone shares every tile with its original until one of the
+/// two writes to it.
+#[derive(Debug, Clone, Default)]
+pub struct LikelihoodField {
+    /// Two cells a byte: that of the even column in the lower bits.
+    pairs: TileMap<u8>,
+}
+
+impl LikelihoodField {
+    /// A field without hits.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { pairs: TileMap::new() }
+    }
+
+    /// The level of one cell, from 0 to [`FULL`].
+    #[must_use]
+    pub fn get(&self, cell: Cell) -> u8 {
+        level(self.pairs.get(pair(cell)), cell.ix as u32)
+    }
+
+    /// Its tiles, for counting them.
+    #[must_use]
+    pub const fn tiles(&self) -> &TileMap<u8> {
+        &self.pairs
+    }
+}
+
+/// Where the pair of a cell is among the pairs.
+const fn pair(cell: Cell) -> Cell {
+    Cell::new(cell.ix >> 1, cell.iy)
+}
+
+/// The level in a pair of the cell in `column`.
+#[inline(always)]
+const fn level(pair: u8, column: u32) -> u8 {
+    (pair >> ((column & 1) * 4)) & FULL
+}
 
 /// Points of a scan in the base frame, in cells, kept apart by axis for vector instructions.
 #[derive(Debug, Clone, Default)]
@@ -119,18 +167,18 @@ pub struct Linearization {
 impl<'a> Window<'a> {
     /// The cells of `field` within `radius` cells of `centre`.
     #[must_use]
-    pub fn around(field: &'a TileMap<u8>, centre: Cell, radius: i32) -> Self {
-        let first = TileKey::containing(Cell::new(centre.ix - radius, centre.iy - radius));
-        let last = TileKey::containing(Cell::new(centre.ix + radius, centre.iy + radius));
+    pub fn around(field: &'a LikelihoodField, centre: Cell, radius: i32) -> Self {
+        let first = tile_of(Cell::new(centre.ix - radius, centre.iy - radius));
+        let last = tile_of(Cell::new(centre.ix + radius, centre.iy + radius));
         let width = (last.tx - first.tx + 1) as usize;
         let height = (last.ty - first.ty + 1) as usize;
         let width_shift = width.next_power_of_two().trailing_zeros();
         let mut tiles = vec![EMPTY; height << width_shift];
-        for (key, tile) in field.tiles_between(first, last) {
+        for (key, tile) in field.pairs.tiles_between(first, last) {
             let row = (key.ty - first.ty) as usize;
             tiles[(row << width_shift) + (key.tx - first.tx) as usize] = tile;
         }
-        Self { first_cell: first.first_cell(), width_shift, tiles }
+        Self { first_cell: first_cell(first), width_shift, tiles }
     }
 
     /// The cell at the window's lower-left corner.
@@ -139,7 +187,7 @@ impl<'a> Window<'a> {
         self.first_cell
     }
 
-    /// Σ of the field's bytes at the points' cells.
+    /// Σ of the field's levels at the points' cells.
     #[must_use]
     pub fn score(&self, points: &Points, pose: WindowPose) -> u32 {
         let mut score = 0;
@@ -147,7 +195,7 @@ impl<'a> Window<'a> {
         score
     }
 
-    /// Calls `take` with the field's byte at each point's cell, in order.
+    /// Calls `take` with the field's level at each point's cell, in order.
     pub fn for_each_value(&self, points: &Points, pose: WindowPose, mut take: impl FnMut(u8)) {
         let [cos, sin] = pose.rotation;
         // Rounding to nearest after taking half a cell away is rounding down.
@@ -168,32 +216,39 @@ impl<'a> Window<'a> {
     /// Tile and cell of a column and a row, which may carry other bits above the window's.
     #[inline(always)]
     fn index(&self, column: u32, row: u32) -> u32 {
-        let tile_column = (column >> 5) & ((1 << self.width_shift) - 1);
-        let tile_row = (row >> 5) & 0x1_ffff;
-        (((tile_row << self.width_shift) | tile_column) << 10)
-            | ((row & CELL) << 5)
-            | (column & CELL)
+        let tile_column = (column >> TILE_COLUMNS) & ((1 << self.width_shift) - 1);
+        let tile_row = (row >> TILE_ROWS) & (0x3f_ffff >> TILE_ROWS);
+        let tile = (tile_row << self.width_shift) | tile_column;
+        (((tile << TILE_ROWS) | (row & ROW)) << TILE_COLUMNS) | (column & COLUMN)
+    }
+
+    #[inline(always)]
+    fn tile(&self, index: u32) -> &Tile<u8> {
+        self.tiles.get((index >> (TILE_COLUMNS + TILE_ROWS)) as usize).copied().unwrap_or(EMPTY)
     }
 
     #[inline(always)]
     fn value(&self, index: u32) -> u8 {
-        let tile = self.tiles.get((index >> 10) as usize).copied().unwrap_or(EMPTY);
-        tile[index as usize & (TILE_CELLS - 1)]
+        level(self.tile(index)[(index as usize & CELL) / 2], index)
     }
 
-    /// The bytes of a cell and its neighbours right, above, and right above.
+    /// The levels of a cell and its neighbours right, above, and right above, at the bits of
+    /// [`CORNERS`].
     #[inline(always)]
-    fn values_around(&self, column: u32, row: u32) -> [u8; 4] {
-        let index = self.index(column, row);
-        let inner = index as usize & (TILE_CELLS - 1);
-        if column & CELL < CELL && row & CELL < CELL {
-            let tile = self.tiles.get((index >> 10) as usize).copied().unwrap_or(EMPTY);
-            let upper = (inner + TILE_SIZE).min(TILE_CELLS - 2);
-            [tile[inner], tile[inner + 1], tile[upper], tile[upper + 1]]
+    fn levels_around(&self, column: u32, row: u32) -> u32 {
+        if column & COLUMN < COLUMN && row & ROW < ROW {
+            let index = self.index(column, row);
+            let tile = self.tile(index);
+            let pair = (index as usize & CELL) / 2;
+            let pairs = [pair, pair + 1, pair + TILE_SIZE, pair + TILE_SIZE + 1];
+            u32::from_le_bytes(pairs.map(|pair| tile[pair % TILE_CELLS])) >> ((column & 1) * 4)
         } else {
             let (right, above) = (column.wrapping_add(1), row.wrapping_add(1));
             [(column, row), (right, row), (column, above), (right, above)]
-                .map(|(column, row)| self.value(self.index(column, row)))
+                .map(|(column, row)| u32::from(self.value(self.index(column, row))))
+                .into_iter()
+                .zip(CORNERS)
+                .fold(0, |levels, (level, bit)| levels | (level << bit))
         }
     }
 
@@ -210,7 +265,7 @@ impl<'a> Window<'a> {
         let mut sums = Sums::default();
         let mut block = Block::default();
         for (xs, ys) in points.x.chunks(BLOCK).zip(points.y.chunks(BLOCK)) {
-            block.corners.iter_mut().for_each(|corner| corner[xs.len()..].fill(0.0));
+            block.levels[xs.len()..].fill(0);
             for (i, (x, y)) in xs.iter().zip(ys).enumerate() {
                 let (dx, dy) = (cos * x - sin * y, sin * x + cos * y);
                 let (column, row) = (dx + x0 + ROUND, dy + y0 + ROUND);
@@ -222,10 +277,7 @@ impl<'a> Window<'a> {
                 block.fraction_y[i] = (dy + y0) - (row - ROUND) + 0.5;
             }
             for i in 0..xs.len() {
-                let values = self.values_around(block.column[i], block.row[i]);
-                for (corner, value) in block.corners.iter_mut().zip(values) {
-                    corner[i] = f32::from(value) * (1.0 / 255.0);
-                }
+                block.levels[i] = self.levels_around(block.column[i], block.row[i]);
             }
             sums.add(&block);
         }
@@ -242,8 +294,8 @@ struct Block {
     /// From the base to the point, in the directions of the map's axes.
     arm_x: [f32; BLOCK],
     arm_y: [f32; BLOCK],
-    /// Left below, right below, left above, right above; zero past the last point.
-    corners: [[f32; BLOCK]; 4],
+    /// As [`Window::levels_around`] packs them; zero past the last point.
+    levels: [u32; BLOCK],
 }
 
 impl Default for Block {
@@ -256,7 +308,7 @@ impl Default for Block {
             fraction_y: zero,
             arm_x: zero,
             arm_y: zero,
-            corners: [zero; 4],
+            levels: [0; BLOCK],
         }
     }
 }
@@ -271,7 +323,9 @@ impl Sums {
         for start in (0..BLOCK).step_by(LANES) {
             for lane in 0..LANES {
                 let i = start + lane;
-                let [m00, m10, m01, m11] = [0, 1, 2, 3].map(|corner| block.corners[corner][i]);
+                let [m00, m10, m01, m11] = CORNERS.map(|bit| {
+                    ((block.levels[i] >> bit) & u32::from(FULL)) as i32 as f32 * (1.0 / FULL as f32)
+                });
                 let (fx, fy) = (block.fraction_x[i], block.fraction_y[i]);
                 let (below, above) = (m00 + fx * (m10 - m00), m01 + fx * (m11 - m01));
                 let m = below + fy * (above - below);
@@ -302,17 +356,30 @@ impl Sums {
     }
 }
 
-/// The bytes around a hit, for each of its positions within a cell.
+/// The tile that holds a cell.
+const fn tile_of(cell: Cell) -> TileKey {
+    TileKey::containing(pair(cell))
+}
+
+/// The lower-left cell of a tile.
+const fn first_cell(tile: TileKey) -> Cell {
+    let pair = tile.first_cell();
+    Cell::new(pair.ix << 1, pair.iy)
+}
+
+/// The levels around a hit, for each of its positions within a cell.
 #[derive(Debug, Clone)]
 pub struct Kernel {
     radius: i32,
     /// Bytes from one row of a stamp to the next.
     stride: usize,
-    /// For each phase, rows of `2 * radius + 1` bytes, bottom first, each between zeros as wide
-    /// as a tile: however a stamp lies over a tile, each of its rows is as long as the tile's.
-    stamps: Vec<Vec<u8>>,
-    /// For each phase, from which value on a cell has nothing to learn from a hit in it.
-    known: Vec<u8>,
+    /// For each phase, a stamp that begins in an even column and one that begins in an odd one:
+    /// rows of pairs, bottom first, each between zeros as wide as a tile. However a stamp lies
+    /// over a tile, each of its rows is as long as the tile's.
+    stamps: Vec<[Vec<u8>; 2]>,
+    /// For each phase, the level of the hit's own cell: one that has it learns nothing from the
+    /// hit.
+    centres: Vec<u8>,
 }
 
 /// A hit to stamp: its cell, and where in the cell it lies.
@@ -326,37 +393,52 @@ impl Kernel {
     /// A kernel of standard deviation `sigma`, in cells.
     #[must_use]
     pub fn new(sigma: f64) -> Self {
-        let radius = floor(3.0 * sigma) + 1;
-        let phase = |p: usize| (p as f64 + 0.5) / PHASES as f64;
-        let stamps = (0..PHASES * PHASES).map(|p| {
-            let (hit_x, hit_y) = (phase(p % PHASES), phase(p / PHASES));
-            let value = |dx: i32, dy: i32| {
-                let (x, y) = (f64::from(dx) + 0.5 - hit_x, f64::from(dy) + 0.5 - hit_y);
-                libm::round(255.0 * libm::exp(-0.5 * (x * x + y * y) / (sigma * sigma))) as u8
+        // A cell further away than this has a level below a half.
+        let reach = sigma * libm::sqrt(2.0 * libm::log(2.0 * f64::from(FULL)));
+        let radius = libm::ceil(reach - 0.5).max(1.0) as i32;
+        let position = |p: usize| (p as f64 + 0.5) / PHASES as f64;
+        let (mut stamps, mut centres) = (Vec::new(), Vec::new());
+        for phase in 0..PHASES * PHASES {
+            let hit = [position(phase % PHASES), position(phase / PHASES)];
+            let level = |dx: i32, dy: i32| {
+                if dx.abs() > radius {
+                    return 0;
+                }
+                let (x, y) = (f64::from(dx) + 0.5 - hit[0], f64::from(dy) + 0.5 - hit[1]);
+                let share = libm::exp(-0.5 * (x * x + y * y) / (sigma * sigma));
+                libm::round(f64::from(FULL) * share) as u8
             };
-            let row = |dy| {
-                let values = (-radius..=radius).map(move |dx| value(dx, dy));
-                let zeros = [0; TILE_SIZE];
-                zeros.into_iter().chain(values).chain(zeros)
-            };
-            let stamp: Vec<u8> = (-radius..=radius).flat_map(row).collect();
-            (stamp, value(0, 0).saturating_sub(KNOWN_WITHIN))
-        });
-        let (stamps, known) = stamps.unzip();
-        let stride = 2 * TILE_SIZE + 2 * radius as usize + 1;
-        Self { radius, stride, stamps, known }
+            centres.push(level(0, 0));
+            stamps.push([0, 1].map(|parity| {
+                let row = |dy| {
+                    let first = -radius - parity;
+                    let pairs = (0..=radius).map(move |i| first + 2 * i);
+                    let pairs = pairs.map(move |dx| level(dx, dy) | (level(dx + 1, dy) << 4));
+                    let zeros = [0; TILE_SIZE];
+                    zeros.into_iter().chain(pairs).chain(zeros)
+                };
+                (-radius..=radius).flat_map(row).collect()
+            }));
+        }
+        Self { radius, stride: 2 * TILE_SIZE + radius as usize + 1, stamps, centres }
     }
 
     /// Enters hits seen from `pose`, which is relative to the lower-left corner of `origin`.
     ///
     /// Hits in cells that already are near a hit change nothing, and copy no tile.
-    pub fn insert(&self, field: &mut TileMap<u8>, origin: Cell, hits: &Points, pose: WindowPose) {
+    pub fn insert(
+        &self,
+        field: &mut LikelihoodField,
+        origin: Cell,
+        hits: &Points,
+        pose: WindowPose,
+    ) {
         let stamps = self.unknown(field, origin, hits, pose);
         let mut by_tile = Vec::with_capacity(2 * stamps.len());
         for stamp in &stamps {
             let corner = |sign| {
                 let reach = sign * self.radius;
-                TileKey::containing(Cell::new(stamp.hit.ix + reach, stamp.hit.iy + reach))
+                tile_of(Cell::new(stamp.hit.ix + reach, stamp.hit.iy + reach))
             };
             let (first, last) = (corner(-1), corner(1));
             for ty in first.ty..=last.ty {
@@ -366,9 +448,9 @@ impl Kernel {
         by_tile.sort_unstable_by_key(|(key, _)| *key);
         for group in by_tile.chunk_by(|a, b| a.0 == b.0) {
             let key = group[0].0;
-            let tile = field.tile_mut(key);
+            let tile = field.pairs.tile_mut(key);
             for (_, stamp) in group {
-                self.stamp(tile, key.first_cell(), *stamp);
+                self.stamp(tile, first_cell(key), *stamp);
             }
         }
     }
@@ -376,14 +458,14 @@ impl Kernel {
     /// The hits that the field has something to learn from.
     fn unknown(
         &self,
-        field: &TileMap<u8>,
+        field: &LikelihoodField,
         origin: Cell,
         hits: &Points,
         pose: WindowPose,
     ) -> Vec<Stamp> {
         let [cos, sin] = pose.rotation;
         let (x0, y0) = ((pose.x - 0.5) as f32, (pose.y - 0.5) as f32);
-        let mut tile = (TileKey::containing(origin), field.tile(TileKey::containing(origin)));
+        let mut tile = (tile_of(origin), field.pairs.tile(tile_of(origin)));
         let mut stamps = Vec::new();
         let (mut x_in_cells, mut y_in_cells) = ([0.0; BLOCK], [0.0; BLOCK]);
         let mut cells = [Cell::new(0, 0); BLOCK];
@@ -396,15 +478,15 @@ impl Kernel {
             }
             for (i, cell) in cells[..xs.len()].iter().enumerate() {
                 let hit = Cell::new(origin.ix + cell.ix, origin.iy + cell.iy);
-                let key = TileKey::containing(hit);
+                let key = tile_of(hit);
                 if tile.0 != key {
-                    tile = (key, field.tile(key));
+                    tile = (key, field.pairs.tile(key));
                 }
                 let column = phase(x_in_cells[i] - cell.ix as f32 + 0.5);
                 let row = phase(y_in_cells[i] - cell.iy as f32 + 0.5);
                 let phase = row * PHASES + column;
-                let value = tile.1.map_or(0, |tile| tile[index_in_tile(hit)]);
-                if value < self.known[phase] {
+                let pair = tile.1.map_or(0, |tile| tile[index_in_tile(pair(hit))]);
+                if level(pair, hit.ix as u32) < self.centres[phase] {
                     stamps.push(Stamp { hit, phase });
                 }
             }
@@ -418,22 +500,24 @@ impl Kernel {
         let (left, bottom) = (hit.ix - self.radius - first.ix, hit.iy - self.radius - first.iy);
         let (start, end) = (bottom.max(0), (bottom + side).min(size));
         let rows = &mut tile[start as usize * TILE_SIZE..end as usize * TILE_SIZE];
-        let stamp = &self.stamps[phase][(start - bottom) as usize * self.stride..];
-        let from = (size - left) as usize;
+        let stamp = &self.stamps[phase][(left & 1) as usize];
+        let stamp = &stamp[(start - bottom) as usize * self.stride..];
+        let from = (size - (left >> 1)) as usize;
         let (rows, _) = rows.as_chunks_mut::<TILE_SIZE>();
-        for (cells, values) in rows.iter_mut().zip(stamp.chunks_exact(self.stride)) {
-            if let Some(values) = values[from..].first_chunk::<TILE_SIZE>() {
-                raise(cells, values);
+        for (pairs, levels) in rows.iter_mut().zip(stamp.chunks_exact(self.stride)) {
+            if let Some(levels) = levels[from..].first_chunk::<TILE_SIZE>() {
+                raise(pairs, levels);
             }
         }
     }
 }
 
-/// Raises each cell to its new value. A call of its own, so that it becomes vector instructions.
+/// Raises each cell to its new level. A call of its own, so that it becomes vector instructions.
 #[inline(never)]
-fn raise(cells: &mut [u8; TILE_SIZE], values: &[u8; TILE_SIZE]) {
-    for (cell, value) in cells.iter_mut().zip(values) {
-        *cell = (*cell).max(*value);
+fn raise(pairs: &mut [u8; TILE_SIZE], levels: &[u8; TILE_SIZE]) {
+    const ODD: u8 = FULL << 4;
+    for (pair, level) in pairs.iter_mut().zip(levels) {
+        *pair = (*pair & FULL).max(level & FULL) | (*pair & ODD).max(level & ODD);
     }
 }
 

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use super::Cell;
 
 /// Cells along the side of a tile.
-pub const TILE_SIZE: usize = 32;
+pub const TILE_SIZE: usize = 16;
 /// Cells in a tile.
 pub const TILE_CELLS: usize = TILE_SIZE * TILE_SIZE;
 const TILE_SHIFT: u32 = TILE_SIZE.trailing_zeros();
