@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use std::io::{BufRead as _, BufReader};
-use std::process::{Command as Process, Stdio};
+use std::process::{Child, Command as Process, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -651,22 +651,80 @@ async fn the_daemon_runs_until_it_is_told_to_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_last_map_is_saved_if_that_is_configured() {
+    let directory = tempfile::tempdir().unwrap();
+    let into = format!("save_directory={}", directory.path().join("maps").display());
+    let mut rig = Rig::mounted(&[&into, "save_on_exit=last"]).await;
+    rig.feed(&drive(1)[0]).await;
+    rig.verdict().await;
+    let snapshot = rig.end().await;
+    let saved = std::fs::read(directory.path().join("maps/last.pgm")).unwrap();
+    assert_eq!(saved, gmapd::map::pgm(&grid(&snapshot).unwrap()));
+
+    let (session, _) = listening().await;
+    let wrong = settings(&["save_on_exit=../last"]);
+    let error = Daemon::start(&session, wrong).await.unwrap_err();
+    assert!(error.to_string().starts_with("save_on_exit: "), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_key_with_a_wildcard_is_an_error() {
     let (session, _) = listening().await;
     let error = Daemon::start(&session, settings(&["keys={odom: '*'}"])).await.unwrap_err();
     assert!(error.to_string().contains("has a wildcard"), "{error}");
 }
 
+/// The standard error of a program up to a line that says so much.
+fn said(lines: &mut impl Iterator<Item = std::io::Result<String>>, what: &str) -> String {
+    lines.map(Result::unwrap).find(|line| line.contains(what)).expect(what)
+}
+
+/// `gmapd run`, which does not outlive its test.
+struct Program(Child);
+
+impl Program {
+    fn start(endpoint: &str, log: &str) -> Self {
+        let program = Process::new(env!("CARGO_BIN_EXE_gmapd"))
+            .args(["run", "--prefix", ROBOT, "--set", "particles=6", "-e", endpoint])
+            .env("GMAPD_LOG", log)
+            .stderr(Stdio::piped())
+            .spawn();
+        Self(program.unwrap())
+    }
+
+    fn lines(&mut self) -> impl Iterator<Item = std::io::Result<String>> + use<> {
+        BufReader::new(self.0.stderr.take().unwrap()).lines()
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().ok();
+    }
+}
+
+/// Ends a program as an operator does, and checks that it ends well.
+async fn terminate(mut program: Program) {
+    let id = program.0.id().to_string();
+    assert!(Process::new("kill").args(["-TERM", &id]).status().unwrap().success());
+    let ended = tokio::task::spawn_blocking(move || program.0.wait().unwrap());
+    let status = tokio::time::timeout(Duration::from_secs(2), ended).await;
+    assert_eq!(status.expect("it did not end in time").unwrap().code(), Some(0));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_program_ends_while_nobody_answers_where_it_connects() {
+    let mut program = Program::start("tcp/127.0.0.1:1", "info");
+    let mut lines = program.lines();
+    said(&mut lines, "connecting to tcp/127.0.0.1:1");
+    terminate(program).await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_program_maps_and_ends_with_exit_code_zero_within_two_seconds() {
     let (session, locator) = listening().await;
-    let mut program = Process::new(env!("CARGO_BIN_EXE_gmapd"))
-        .args(["run", "--prefix", ROBOT, "--set", "particles=6", "-e", &locator])
-        .env_remove("RUST_LOG")
-        .env("GMAPD_LOG", "warn,gmapd=debug")
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut program = Program::start(&locator, "warn,gmapd=debug");
     let robot = Robot::start(&session, Wire::LittleEndian).await;
     robot.mount(BASE_FROM_LASER).await;
     for moment in drive(30) {
@@ -675,14 +733,9 @@ async fn the_program_maps_and_ends_with_exit_code_zero_within_two_seconds() {
     }
     // Refused after all that came before it, and logged.
     robot.odom.put("the end").await.unwrap();
-    let mut lines = BufReader::new(program.stderr.take().unwrap()).lines();
-    let said = lines.by_ref().map(Result::unwrap).find(|line| line.contains("rejected a message"));
-    assert!(said.is_some_and(|line| line.contains("nav_msgs/msg/Odometry")));
-    let kill = Process::new("kill").args(["-TERM", &program.id().to_string()]).status().unwrap();
-    assert!(kill.success());
-    let ended = tokio::task::spawn_blocking(move || program.wait().unwrap());
-    let status = tokio::time::timeout(Duration::from_secs(2), ended).await;
-    let status = status.expect("it did not end in time").unwrap();
-    assert_eq!(status.code(), Some(0));
-    assert!(lines.map(Result::unwrap).any(|line| line.contains("ending")));
+    let mut lines = program.lines();
+    let rejected = said(&mut lines, "rejected a message");
+    assert!(rejected.contains("nav_msgs/msg/Odometry"), "{rejected}");
+    terminate(program).await;
+    said(&mut lines, "ending");
 }

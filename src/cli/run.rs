@@ -3,13 +3,16 @@
 use std::io::IsTerminal as _;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use clap::Args;
 use gmapd::config::Config;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::{self, Settings};
+use tokio::runtime::Handle;
 use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::task::spawn_blocking;
 use tracing_subscriber::EnvFilter;
 
 use super::session::SessionArguments;
@@ -19,6 +22,9 @@ const LOG_FILTER: &str = "warn,gmapd=info";
 
 /// Exit code of a process that a second Ctrl-C ended, as shells count it.
 const INTERRUPTED: i32 = 130;
+
+/// How long tasks that are left may take at the end.
+const LAST_BREATH: Duration = Duration::from_millis(100);
 
 /// What to map, and where the mesh is.
 #[derive(Debug, Args)]
@@ -64,7 +70,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .enable_all()
         .build()
         .context("cannot start the threads of the daemon")?;
-    runtime.block_on(until_signalled(settings, &arguments.mesh))
+    let ended = runtime.block_on(until_signalled(settings, &arguments.mesh));
+    // Zenoh blocks threads while it connects or its network is slow.
+    runtime.shutdown_timeout(LAST_BREATH);
+    ended
 }
 
 fn start_log() -> anyhow::Result<()> {
@@ -103,8 +112,11 @@ async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow:
     if !mesh.endpoints().is_empty() {
         tracing::info!("connecting to {}", mesh.endpoints().join(", "));
     }
+    let (runtime, reachable) = (Handle::current(), mesh.clone());
+    // It blocks the thread that polls it.
+    let opening = spawn_blocking(move || runtime.block_on(reachable.open_when_reachable()));
     let session = tokio::select! {
-        session = mesh.open_when_reachable() => session?,
+        session = opening => session.context("the session could not be opened")??,
         () = signals.next() => return Ok(()),
     };
     let robot = settings.prefix.to_string();

@@ -106,12 +106,24 @@ fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
     Ok(key.into())
 }
 
-/// What Zenoh says is wrong, without the place in its sources where it noticed.
+/// What Zenoh says is wrong, without the places in its sources where it noticed.
 #[must_use]
 pub fn plain_message(error: &zenoh::Error) -> String {
-    let text = error.to_string();
-    let message = text.split_once(" at /").map_or(text.as_str(), |(message, _)| message);
-    message.trim_end_matches(['!', ' ', '.']).to_owned()
+    without_places(&error.to_string())
+}
+
+/// Zenoh writes places as in ` at /path/to/file.rs:12.`
+fn without_places(text: &str) -> String {
+    let mut plain = String::new();
+    let mut rest = text;
+    while let Some((before, place)) = rest.split_once(" at /") {
+        plain.push_str(before);
+        let after = place.split_once(".rs:").map_or("", |(_, after)| after);
+        rest = after.trim_start_matches(|c: char| c.is_ascii_digit());
+        rest = rest.strip_prefix('.').unwrap_or(rest);
+    }
+    plain.push_str(rest);
+    plain.trim_end_matches(['!', ' ', '.']).to_owned()
 }
 
 #[cfg(test)]
@@ -128,6 +140,13 @@ mod tests {
         let names = Keys { odom: "*".to_owned(), ..Keys::default() };
         let error = InputKeys::new(&Prefix::parse("").unwrap(), &names).unwrap_err();
         assert_eq!(error, KeyError::Wildcard("*".to_owned()));
+    }
+
+    #[test]
+    fn messages_do_not_say_where_in_the_sources_they_arose() {
+        let text = "Can not bind: [Cannot assign at all at /a/src/tcp.rs:61.] at /b/lib.rs:338.";
+        assert_eq!(without_places(text), "Can not bind: [Cannot assign at all]");
+        assert_eq!(without_places("Unable to connect! "), "Unable to connect");
     }
 
     #[test]

@@ -33,7 +33,8 @@ use std::time::Duration;
 
 use thiserror::Error;
 use tokio::sync::{broadcast, mpsc, oneshot, watch};
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, spawn_blocking};
+use zenoh::Wait as _;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
@@ -47,14 +48,14 @@ use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
 use self::save::{NameError, SaveName, Saver};
 use self::serving::{Serving, ServingError, Sources};
-use self::snapshot::{Snapshot, State};
+use self::snapshot::{MapVersion, Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
 use crate::config::Config;
 use crate::slam::gmapping::ThreadsError;
 
 /// At the end, what waits in the mailbox is worked off for this long.
-const DRAIN: Duration = Duration::from_millis(1400);
+const DRAIN: Duration = Duration::from_millis(1200);
 
 /// How long anything else may take at the end.
 const CLOSE: Duration = Duration::from_millis(200);
@@ -128,15 +129,16 @@ pub async fn run(
         () = daemon.mapper_ended() => Err(DaemonError::MapperEnded),
     };
     daemon.stop().await;
-    // What it would still send is not worth waiting for.
-    tokio::time::timeout(CLOSE, session.close()).await.ok();
+    // What it would still send is not worth waiting for; letting the session go could block.
+    let closing = tokio::spawn(async move { session.close().await });
+    tokio::time::timeout(CLOSE, closing).await.ok();
     ended
 }
 
 /// A daemon that runs.
 #[derive(Debug)]
 pub struct Daemon {
-    /// `None` once undeclared.
+    /// `None` before it listens and once it does no more.
     subscribers: Option<Subscribers>,
     inbox: Arc<Inbox>,
     mailbox: Arc<Mailbox>,
@@ -147,14 +149,14 @@ pub struct Daemon {
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
     status: Arc<StatusSource>,
-    /// `None` once stopped.
+    /// `None` before it has started and once stopped.
     serving: Option<Serving>,
     saving: Saving,
     helpers: [JoinHandle<()>; 2],
 }
 
 /// What is saved at the end.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Saving {
     name: Option<SaveName>,
     directory: PathBuf,
@@ -174,8 +176,24 @@ impl Daemon {
     /// When a key cannot be used, or a thread does not start.
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
-        let exit_name = config.raw.save_on_exit.as_deref().map(SaveName::parse).transpose()?;
         let keys = InputKeys::new(&prefix, &config.raw.keys)?;
+        let mut daemon = Self::deaf(&config, &keys, threads)?;
+        let sources = Sources {
+            snapshots: daemon.snapshots(),
+            verdicts: daemon.verdicts(),
+            commands: daemon.commands(),
+            status: asked(&daemon.status),
+        };
+        let served = serving::Settings::new(&config, daemon.saving.directory());
+        daemon.serving = Some(Serving::start(session, &prefix, served, sources).await?);
+        daemon.subscribers = Some(subscribe(session, &keys, &daemon.inbox).await?);
+        tell_keys(&keys);
+        Ok(daemon)
+    }
+
+    /// All threads and tasks of a daemon that hears and tells nothing yet.
+    fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
+        let saving = Saving::new(config)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
@@ -188,7 +206,7 @@ impl Daemon {
             verdicts: verdicts.clone(),
             gauges: Arc::clone(&gauges),
         };
-        let mapper = spawn(Mapper::new(connections, &config, &keys, threads)?)?;
+        let mapper = spawn(Mapper::new(connections, config, keys, threads)?)?;
         let decoder = tokio::spawn(input::decode(Arc::clone(&inbox), Arc::clone(&mailbox)));
         let shared = Shared {
             inbox: Arc::clone(&inbox),
@@ -202,19 +220,8 @@ impl Daemon {
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),
             tokio::spawn(log_changes(Arc::clone(&status))),
         ];
-        let sources = Sources {
-            snapshots: snapshots.clone(),
-            verdicts: verdicts.subscribe(),
-            commands: commands.clone(),
-            status: asked(&status),
-        };
-        let saving = Saving::new(&config, exit_name);
-        let served = serving::Settings::new(&config, saving.directory());
-        let serving = Serving::start(session, &prefix, served, sources).await?;
-        let subscribers = subscribe(session, &keys, &inbox).await?;
-        tell_keys(&keys);
         Ok(Self {
-            subscribers: Some(subscribers),
+            subscribers: None,
             inbox,
             mailbox,
             decoder,
@@ -223,7 +230,7 @@ impl Daemon {
             verdicts,
             commands,
             status,
-            serving: Some(serving),
+            serving: None,
             saving,
             helpers,
         })
@@ -263,7 +270,9 @@ impl Daemon {
     pub async fn stop(mut self) -> Arc<Snapshot> {
         let deadline = clock::now() + DRAIN;
         if let Some(subscribers) = self.subscribers.take() {
-            tokio::time::timeout(CLOSE, subscribers.undeclare()).await.ok();
+            // It blocks while the network is slow.
+            let undeclare = spawn_blocking(move || subscribers.undeclare());
+            tokio::time::timeout(CLOSE, undeclare).await.ok();
         }
         self.inbox.close();
         tokio::time::timeout(CLOSE, &mut self.decoder).await.ok();
@@ -272,12 +281,14 @@ impl Daemon {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }
         self.helpers.iter().for_each(JoinHandle::abort);
-        // Here the map is saved, if save_on_exit says so.
+        let last = self.snapshots.borrow().clone();
+        let (saving, map) = (self.saving.clone(), last.map.clone());
+        let saved = spawn_blocking(move || saving.save(map));
         if let Some(serving) = self.serving.take() {
             tokio::time::timeout(CLOSE, serving.stop()).await.ok();
         }
-        let last = self.snapshots.borrow().clone();
-        self.saving.save(&last);
+        // It panics for a bug alone, which is told already.
+        saved.await.ok();
         last
     }
 }
@@ -292,11 +303,13 @@ impl Drop for Daemon {
 }
 
 impl Saving {
-    fn new(config: &Config, name: Option<SaveName>) -> Self {
-        let directory = PathBuf::from(&config.raw.save_directory);
+    fn new(config: &Config) -> Result<Self, NameError> {
         let raw = &config.raw;
-        let empty = EmptyMap { frame: raw.map_frame.clone(), resolution: raw.resolution };
-        Self { name, directory, empty }
+        Ok(Self {
+            name: raw.save_on_exit.as_deref().map(SaveName::parse).transpose()?,
+            directory: PathBuf::from(&raw.save_directory),
+            empty: EmptyMap { frame: raw.map_frame.clone(), resolution: raw.resolution },
+        })
     }
 
     fn directory(&self) -> PathBuf {
@@ -304,10 +317,10 @@ impl Saving {
     }
 
     /// Saves the last map, if the configuration asks for it and there is one.
-    fn save(&self, last: &Snapshot) {
+    fn save(self, map: Option<Arc<MapVersion>>) {
         let Some(name) = &self.name else { return };
-        let products = MapProducts::new(last.map.clone(), self.empty.clone());
-        match Saver::new(self.directory.clone()).save(name, &products) {
+        let products = MapProducts::new(map, self.empty);
+        match Saver::new(self.directory).save(name, &products) {
             Ok(saved) => tracing::info!("{}", saved.done),
             Err(error) => tracing::error!("the last map is not saved: {error}"),
         }
@@ -316,11 +329,11 @@ impl Saving {
 
 impl Subscribers {
     /// A session that is closed has none any more, which is as good.
-    async fn undeclare(self) {
+    fn undeclare(self) {
         for subscriber in self.changing {
-            subscriber.undeclare().await.ok();
+            subscriber.undeclare().wait().ok();
         }
-        self.constant.undeclare().await.ok();
+        self.constant.undeclare().wait().ok();
     }
 }
 
