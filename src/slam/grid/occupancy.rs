@@ -165,35 +165,64 @@ impl OccupancyMap {
         let (low, high) = self.bounds()?;
         let (width, height) = ((high.ix - low.ix + 1) as usize, (high.iy - low.iy + 1) as usize);
         let mut cells = vec![-1; width * height];
-        for (cell, count) in self.seen() {
-            let index = (cell.iy - low.iy) as usize * width + (cell.ix - low.ix) as usize;
-            let occupied = f64::from(count.hits) > occupied_threshold * f64::from(count.visits);
-            cells[index] = if occupied { 100 } else { 0 };
+        for (key, tile) in self.counts.tiles() {
+            let first = key.first_cell();
+            let columns = first.ix.max(low.ix)..(first.ix + TILE_SIZE as i32).min(high.ix + 1);
+            for (iy, counts) in (first.iy..).zip(tile.chunks_exact(TILE_SIZE)) {
+                // Beyond the bounds nothing was seen.
+                if columns.is_empty() || !(low.iy..=high.iy).contains(&iy) {
+                    continue;
+                }
+                let start = (iy - low.iy) as usize * width + (columns.start - low.ix) as usize;
+                let counts = &counts[(columns.start - first.ix) as usize..];
+                for (cell, count) in cells[start..][..columns.len()].iter_mut().zip(counts) {
+                    *cell = count.occupancy(occupied_threshold);
+                }
+            }
         }
         let corner = |i: i32| f64::from(i) * self.resolution;
         let origin = Point2::new(corner(low.ix), corner(low.iy));
         Some(OccupancyGrid { resolution: self.resolution, width, height, origin, cells })
     }
 
-    fn seen(&self) -> impl Iterator<Item = (Cell, Count)> {
-        self.counts.tiles().flat_map(|(key, tile)| {
-            let first = key.first_cell();
-            let size = TILE_SIZE as i32;
-            (0..).zip(tile).filter(|(_, count)| count.visits > 0).map(move |(i, count)| {
-                (Cell::new(first.ix + i % size, first.iy + i / size), *count)
-            })
-        })
-    }
-
+    /// The lower-left and the upper-right of the cells that were seen; `None` if there are none.
     fn bounds(&self) -> Option<(Cell, Cell)> {
-        let mut cells = self.seen().map(|(cell, _)| cell);
-        let first = cells.next()?;
-        Some(cells.fold((first, first), |(low, high), cell| {
-            (
-                Cell::new(low.ix.min(cell.ix), low.iy.min(cell.iy)),
-                Cell::new(high.ix.max(cell.ix), high.iy.max(cell.iy)),
-            )
-        }))
+        let mut bounds: Option<(Cell, Cell)> = None;
+        let size = TILE_SIZE as i32;
+        for (key, tile) in self.counts.tiles() {
+            let first = key.first_cell();
+            let inside = bounds.is_some_and(|(low, high)| {
+                low.ix <= first.ix
+                    && low.iy <= first.iy
+                    && first.ix + size <= high.ix
+                    && first.iy + size <= high.iy
+            });
+            if inside {
+                continue;
+            }
+            for (i, _) in (0..).zip(tile).filter(|(_, count)| count.visits > 0) {
+                let (ix, iy) = (first.ix + i % size, first.iy + i / size);
+                let (low, high) = bounds.unwrap_or((Cell::new(ix, iy), Cell::new(ix, iy)));
+                bounds = Some((
+                    Cell::new(low.ix.min(ix), low.iy.min(iy)),
+                    Cell::new(high.ix.max(ix), high.iy.max(iy)),
+                ));
+            }
+        }
+        bounds
+    }
+}
+
+impl Count {
+    /// -1 for a cell nobody looked at, 100 if its share of hits is above the threshold, else 0.
+    fn occupancy(self, occupied_threshold: f64) -> i8 {
+        if self.visits == 0 {
+            -1
+        } else if f64::from(self.hits) > occupied_threshold * f64::from(self.visits) {
+            100
+        } else {
+            0
+        }
     }
 }
 
