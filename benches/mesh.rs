@@ -44,8 +44,8 @@ fn main() {
     simulate.args(["simulate", "--laps", "2", "--out"]).arg(&log);
     assert!(quiet(&mut simulate).status().expect("gmapd runs").success(), "no log to play");
 
-    let alone = drive(&log, false);
-    let asked = drive(&log, true);
+    let alone = drive(&log, 0);
+    let asked = drive(&log, CLIENTS);
     let growth = |name: &str| asked.scan[name].as_f64().zip(alone.scan[name].as_f64());
     let growth = growth("p50").map(|(asked, alone)| asked / alone);
     println!(
@@ -85,8 +85,8 @@ impl Replies {
     }
 }
 
-/// Plays the log to a daemon of its own as fast as it goes; `asked` has clients ask meanwhile.
-fn drive(log: &Path, asked: bool) -> Drive {
+/// Plays the log to a daemon of its own as fast as it goes, while so many clients ask.
+fn drive(log: &Path, clients: usize) -> Drive {
     let (_daemon, endpoint) = start(Command::new(GMAPD).args([
         "run",
         "--prefix",
@@ -104,11 +104,11 @@ fn drive(log: &Path, asked: bool) -> Drive {
     play.args(["play", "--prefix", "robot01", "--rate", "max", "--connect", &endpoint]).arg(log);
     let mut play = Process(quiet(&mut play).spawn().expect("gmapd runs"));
     let (mut busy, mut idle, mut bytes) = (Replies::default(), Replies::default(), 0);
-    if asked {
+    if clients > 0 {
         let own = std::env::current_exe().expect("this program has a path");
         let (_bare, bare_endpoint) = start(Command::new(own).arg("bare"));
         let clients: Vec<[Session; 2]> =
-            (0..CLIENTS).map(|_| [client(&endpoint), client(&bare_endpoint)]).collect();
+            (0..clients).map(|_| [client(&endpoint), client(&bare_endpoint)]).collect();
         let mut ask_both = |replies: &mut Replies| {
             let daemons = clients.iter().map(|[daemon, _]| daemon);
             let (times, size) = burst(daemons, "robot01/map");
