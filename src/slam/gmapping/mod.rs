@@ -117,7 +117,7 @@ pub enum Phase {
     Resample,
     /// The scan enters each particle's map.
     Register,
-    /// The scan enters the output map.
+    /// The scan enters the output map; with several threads while it enters those of the particles.
     Map,
 }
 
@@ -254,9 +254,7 @@ impl GMapping {
         on_phase(Phase::Match);
         let report = self.resample(scan.hits.len());
         on_phase(Phase::Resample);
-        self.register(&scan);
-        on_phase(Phase::Register);
-        self.update_output(scan);
+        self.register(scan, on_phase);
         if report.resampled || self.particles.len() == 1 {
             self.settle();
         }
@@ -343,16 +341,24 @@ impl GMapping {
         report
     }
 
-    fn register(&mut self, scan: &PreparedScan) {
-        let matcher = &self.matcher;
-        for_each(self.pool.as_ref(), &mut self.particles, |_, particle| {
-            matcher.register(particle, scan);
-        });
-    }
-
-    fn update_output(&mut self, scan: PreparedScan) {
+    /// Enters the scan in each particle's map, and in the output map at the same time if there are
+    /// threads.
+    fn register(&mut self, mut scan: PreparedScan, on_phase: &mut dyn FnMut(Phase)) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
-        self.output.extend(&mut self.tree, best, scan.outline);
+        let outline = std::mem::take(&mut scan.outline);
+        let Self { matcher, particles, output, tree, pool, .. } = self;
+        let mut register = || {
+            for_each(pool.as_ref(), particles, |_, particle| matcher.register(particle, &scan));
+        };
+        let extend = || output.extend(tree, best, outline);
+        if let Some(pool) = &*pool {
+            pool.join(register, extend);
+            on_phase(Phase::Register);
+        } else {
+            register();
+            on_phase(Phase::Register);
+            extend();
+        }
     }
 
     /// The weights of the particles that share the likeliest trajectory up to [`HISTORY`] scans

@@ -4,7 +4,8 @@
 //! write copies at most one page of pointers and one tile.
 
 use std::collections::HashSet;
-use std::sync::Arc;
+
+use triomphe::Arc;
 
 use super::Cell;
 
