@@ -6,6 +6,7 @@ mod evaluate;
 mod feed;
 mod get;
 mod list;
+mod log;
 mod mesh;
 mod play;
 mod progress;
