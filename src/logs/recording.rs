@@ -164,6 +164,21 @@ pub enum Message {
     Transforms(ros::TfMessage),
 }
 
+impl Message {
+    /// Its own; of transforms that of the first. `None` if it has none that can be.
+    #[must_use]
+    pub fn stamp(&self) -> Option<Stamp> {
+        let header = match self {
+            Self::LaserScan(scan) => &scan.header,
+            Self::Odometry(odometry) => &odometry.header,
+            Self::Transforms(transforms) => &transforms.transforms.first()?.header,
+        };
+        let ros::Time { sec, nanosec } = header.stamp;
+        let stamp = Stamp(i64::from(sec) * 1_000_000_000 + i64::from(nanosec));
+        (nanosec < 1_000_000_000).then_some(stamp)
+    }
+}
+
 impl RawMessage {
     /// What it says.
     ///
