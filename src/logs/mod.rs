@@ -10,8 +10,10 @@ pub mod carmen_writer;
 mod cursor;
 mod lines;
 mod mcap;
+pub mod mcap_writer;
 pub mod recording;
 mod ros1;
+mod schemas;
 mod source;
 
 use std::collections::BTreeMap;
