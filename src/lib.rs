@@ -27,6 +27,7 @@ pub mod files;
 pub mod logs;
 pub mod map;
 pub mod playback;
+pub mod recorded;
 pub mod replay;
 pub mod ros;
 pub mod sim;

@@ -56,15 +56,36 @@ impl Replay {
         })
     }
 
-    /// Takes the next reading of the log.
+    /// Takes the next reading of a log that no message has carried yet.
     pub fn add(&mut self, reading: &Reading) -> Verdict {
-        let odom_from_base = odometry_as_received(reading);
-        let step = self.add_odometry(reading.stamp, odom_from_base);
-        let verdict = match (&reading.scan, step) {
-            (Some(scan), _) => match scan_as_received(scan) {
-                Some(scan) => self.add_scan(&scan, &reading.mount, odom_from_base),
-                None => Verdict::BadGeometry,
-            },
+        let mount = mount_as_received(&reading.mount);
+        let scan = reading.scan.as_ref().map(scan_as_received);
+        self.take(reading.stamp, odometry_as_received(reading), scan.as_ref(), &mount)
+    }
+
+    /// Takes the next reading as messages have brought it.
+    pub fn add_received(&mut self, reading: &Reading) -> Verdict {
+        let scan = reading.scan.clone().map(Some);
+        self.take(reading.stamp, reading.odom_from_base, scan.as_ref(), &reading.mount)
+    }
+
+    /// Counts a scan that does not reach the filter, for want of odometry or order.
+    pub const fn refuse(&mut self) {
+        self.counts.refused += 1;
+    }
+
+    /// `Some(None)` is a scan that no message can carry.
+    fn take(
+        &mut self,
+        stamp: Stamp,
+        odom_from_base: Pose2,
+        scan: Option<&Option<Scan>>,
+        mount: &LaserMount,
+    ) -> Verdict {
+        let step = self.add_odometry(stamp, odom_from_base);
+        let verdict = match (scan, step) {
+            (Some(Some(scan)), _) => self.add_scan(scan, mount, odom_from_base),
+            (Some(None), _) => Verdict::BadGeometry,
             (None, OdometryUpdate::NotUsable) => Verdict::BadOdometry,
             (None, OdometryUpdate::Accepted | OdometryUpdate::JumpRejected) => {
                 Verdict::OdometryOnly
@@ -98,7 +119,7 @@ impl Replay {
     }
 
     fn add_scan(&mut self, scan: &Scan, mount: &LaserMount, odom_from_base: Pose2) -> Verdict {
-        let mount = &self.mount.unwrap_or_else(|| mount_as_received(mount));
+        let mount = &self.mount.unwrap_or(*mount);
         let reading = ScanReading { scan, mount, odom_from_base };
         let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();

@@ -66,16 +66,17 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 17] = [
+const MAY_USE: [(&str, &[&str]); 18] = [
     ("slam", &[]),
     ("sim", &["slam"]),
-    ("logs", &["slam"]),
+    ("logs", &["ros", "slam"]),
     ("config", &["slam"]),
     ("ros", &[]),
     ("convert", &["ros", "slam", "tf"]),
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
     ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
+    ("recorded", &["clock", "config", "convert", "daemon", "logs", "ros", "slam", "tf"]),
     // Its tests read what the daemon writes.
     ("playback", &["convert", "daemon", "logs", "ros", "slam"]),
     (

@@ -138,11 +138,15 @@ struct Daemon {
 
 impl Daemon {
     fn start(prefix: &str) -> Self {
+        Self::start_with(prefix, &[])
+    }
+
+    fn start_with(prefix: &str, arguments: &[&str]) -> Self {
         let directory = directory();
         let zenoh = file(&directory, "router.json5", ROUTER);
         let mut command = program();
         command.args(["run", "--prefix", prefix, "--zenoh", text(&zenoh), "--threads", "1"]);
-        command.current_dir(directory.path());
+        command.args(arguments).current_dir(directory.path());
         let background = Background::start(&mut command);
         let endpoint = endpoint(&background.line_with("listens on"));
         Self { background, endpoint, _directory: directory }
@@ -214,6 +218,34 @@ fn playing_a_log_gives_the_map_and_path_that_replaying_it_gives() {
         assert!(told.contains(" processed") && !told.contains("overload"), "{told}");
         assert_eq!(answered(&daemon, "map", "map.pgm"), expected["map.pgm"], "rate {rate}");
         assert_eq!(answered(&daemon, "path", "path.tum"), expected["path.tum"], "rate {rate}");
+    }
+}
+
+/// Once by the daemon itself, and once beside it.
+#[test]
+fn a_recording_of_a_live_run_replays_to_its_map() {
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let [inside, beside] = ["inside.mcap", "beside.mcap"].map(|name| directory.path().join(name));
+    let record = format!("record={}", text(&inside));
+    let mut daemon = Daemon::start_with("robot01", &["--set", &record]);
+    let mut command = program();
+    command.args(["record", "robot01", "-e", &daemon.endpoint, "-o", text(&beside)]);
+    let mut recorder = Background::start(&mut command);
+    recorder.line_with("recording robot01");
+    daemon.play(&[text(&log), "--prefix", "robot01", "--rate", "max"]);
+    let live = answered(&daemon, "map", "map.pgm");
+    recorder.interrupt();
+    recorder.line_with("recorded ");
+    assert_eq!(recorder.exit_code(), Some(0));
+    daemon.background.interrupt();
+    assert_eq!(daemon.background.exit_code(), Some(0));
+    for recording in [inside, beside] {
+        succeed(&["replay", text(&recording), "--expect", &live]);
+        // And once more onto the mesh.
+        let daemon = Daemon::start("robot02");
+        daemon.play(&[text(&recording), "--prefix", "robot02", "--rate", "max"]);
+        assert_eq!(answered(&daemon, "map", "map.pgm"), live);
     }
 }
 

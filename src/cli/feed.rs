@@ -7,6 +7,7 @@ use anyhow::{anyhow, bail};
 use gmapd::clock::Stopwatch;
 use gmapd::daemon::keys::Prefix;
 use gmapd::logs::Reading;
+use gmapd::logs::recording::Kind;
 use gmapd::playback::{Backlog, Frames, Messages, Room, VerdictMessage};
 use gmapd::ros;
 use gmapd::slam::pose::Stamp;
@@ -30,6 +31,9 @@ const POLL_PERIOD: Duration = Duration::from_millis(100);
 /// A daemon that does nothing for so long is not coming back.
 const MOST_SILENCE: Duration = Duration::from_secs(30);
 
+/// Messages of static transforms that are kept for daemons that start later.
+const STATIC_TRANSFORMS: usize = 100;
+
 /// For a daemon to take the transforms that come before everything else.
 const MOUNT_PATIENCE: Duration = Duration::from_secs(2);
 
@@ -39,6 +43,7 @@ pub(super) struct Feed {
     status_key: String,
     scan: Publisher<'static>,
     odom: Publisher<'static>,
+    tf: Publisher<'static>,
     tf_static: AdvancedPublisher<'static>,
     _verdict_subscriber: Subscriber<()>,
     verdicts: UnboundedReceiver<VerdictMessage>,
@@ -46,6 +51,8 @@ pub(super) struct Feed {
     /// Before the first reading; `None` if whoever listens is no gmapd.
     at_start: Option<Progress>,
     last_odometry: Option<ros::Odometry>,
+    /// The static transforms sent last.
+    last_mount: Vec<u8>,
     backlog: Backlog,
     tally: BTreeMap<String, u64>,
 }
@@ -87,12 +94,14 @@ impl Feed {
             status_key: robot.key("slam/status")?.to_string(),
             scan: publisher(session, robot, "scan").await?,
             odom: publisher(session, robot, "odom").await?,
+            tf: publisher(session, robot, "tf").await?,
             tf_static: cached_publisher(session, robot, "tf_static").await?,
             _verdict_subscriber: verdict_subscriber,
             verdicts,
             frames: Frames::default(),
             at_start: None,
             last_odometry: None,
+            last_mount: Vec::new(),
             backlog: Backlog::default(),
             tally: BTreeMap::new(),
         })
@@ -128,10 +137,14 @@ impl Feed {
 
     /// Tells how the laser sits; a daemon gets time to take it before the first scan.
     pub(super) async fn announce(&self, stamp: Stamp, mount: &LaserMount) -> anyhow::Result<()> {
-        let message = ros::cdr(&self.frames.mount(stamp, mount));
+        self.announce_message(ros::cdr(&self.frames.mount(stamp, mount))).await
+    }
+
+    async fn announce_message(&self, message: Vec<u8>) -> anyhow::Result<()> {
+        let before = if self.at_start.is_some() { self.progress().await? } else { None };
         let put = self.tf_static.put(message).encoding(Encoding::APPLICATION_CDR).await;
         put.map_err(|error| anyhow!(error))?;
-        let Some(start) = self.at_start else { return Ok(()) };
+        let Some(start) = before else { return Ok(()) };
         let watch = Stopwatch::start();
         while watch.elapsed().wall < MOUNT_PATIENCE {
             if self.progress().await?.is_none_or(|now| now.transforms > start.transforms) {
@@ -154,6 +167,37 @@ impl Feed {
         if let Some(scan) = scan {
             self.scan.put(ros::cdr(&scan)).await.map_err(|error| anyhow!(error))?;
             self.backlog.scan_sent(reading.stamp);
+        }
+        self.take_verdicts();
+        Ok(())
+    }
+
+    /// Sends a message as it was recorded, in ROS 2's bytes.
+    pub(super) async fn send_recorded(
+        &mut self,
+        kind: Kind,
+        stamp: Stamp,
+        bytes: Vec<u8>,
+    ) -> anyhow::Result<()> {
+        match kind {
+            Kind::LaserScan => {
+                self.scan.put(bytes).await.map_err(|error| anyhow!(error))?;
+                self.backlog.scan_sent(stamp);
+            }
+            Kind::Odometry => {
+                self.odom.put(bytes).await.map_err(|error| anyhow!(error))?;
+                self.backlog.odometry_sent();
+            }
+            Kind::Transforms => {
+                self.tf.put(bytes).await.map_err(|error| anyhow!(error))?;
+                self.backlog.odometry_sent();
+            }
+            // Some tell the same again and again.
+            Kind::StaticTransforms if bytes == self.last_mount => {}
+            Kind::StaticTransforms => {
+                self.last_mount.clone_from(&bytes);
+                self.announce_message(bytes).await?;
+            }
         }
         self.take_verdicts();
         Ok(())
@@ -216,7 +260,8 @@ impl Feed {
         let received = |input: &str| status.inputs.get(input).map_or(0, |input| input.received);
         Ok(Some(Progress {
             verdicts: status.scans.values().sum(),
-            odometry: received("odom"),
+            // Transforms may tell odometry, too.
+            odometry: received("odom") + received("tf"),
             transforms: received("tf_static"),
         }))
     }
@@ -253,7 +298,7 @@ async fn publisher(
         .map_err(|error| anyhow!(error))
 }
 
-/// Keeps the last sample for daemons that start later.
+/// Keeps the last samples for daemons that start later.
 async fn cached_publisher(
     session: &Session,
     robot: &Prefix,
@@ -262,7 +307,7 @@ async fn cached_publisher(
     session
         .declare_publisher(robot.key(name)?)
         .congestion_control(CongestionControl::Block)
-        .cache(CacheConfig::default().max_samples(1))
+        .cache(CacheConfig::default().max_samples(STATIC_TRANSFORMS))
         .sample_miss_detection(MissDetectionConfig::default())
         .publisher_detection()
         .await

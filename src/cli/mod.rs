@@ -6,10 +6,12 @@ mod evaluate;
 mod feed;
 mod get;
 mod list;
+mod log;
 mod mesh;
 mod play;
 mod progress;
 mod readable;
+mod record;
 mod replay;
 mod run;
 mod save;
@@ -27,6 +29,7 @@ use clap::{Parser, Subcommand};
         gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
         gmapd get robot01 map                          a robot's map, drawn\n  \
         gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
+        gmapd record robot01 -o run.mcap               what it sends and the map, for later\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
         gmapd replay run.log --out out                 map a recorded run\n  \
         gmapd replay run.log --set particles=60        with more particles\n  \
@@ -56,6 +59,8 @@ pub(crate) enum Command {
     List(list::Arguments),
     /// Watch a robot's input and say what is wrong
     Doctor(doctor::Arguments),
+    /// Record what a robot sends and what is made of it
+    Record(record::Arguments),
     /// Map a recorded run
     Replay(replay::Arguments),
     /// Drive a simulated robot and record what it sees
@@ -74,6 +79,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<()> {
         Command::Save(arguments) => save::run(&arguments),
         Command::List(arguments) => list::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
+        Command::Record(arguments) => record::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),

@@ -5,40 +5,47 @@ use std::io::Write as _;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use clap::Args;
 use gmapd::clock::Stopwatch;
 use gmapd::config::Config;
 use gmapd::evaluation::{tum, tum_of_path};
 use gmapd::files::write_atomically;
-use gmapd::logs::LogStatistics;
-use gmapd::logs::carmen::CarmenLog;
 use gmapd::map;
+use gmapd::recorded::Event;
 use gmapd::replay::{Hashes, Outcome, PhaseTimes, Replay, Run, Summary};
 use gmapd::slam::pose::Point2;
 use sha2::{Digest as _, Sha256};
 
+use super::log::{Log, Refusals, TopicArguments};
 use super::progress::Progress;
-
-/// Malformed lines that are told one by one.
-const MALFORMED_SHOWN: usize = 10;
 
 /// What to replay, and how.
 #[derive(Debug, Args)]
 #[command(after_help = "\
-    The log is in CARMEN's format, plain or gzipped: FLASER, ROBOTLASER1, ODOM and PARAM lines\n\
-    are used, others are counted. It is replayed in file order, as fast as it goes.\n\
+    The log is one of these, told by its first bytes:\n\
+    - CARMEN, plain or gzipped: FLASER, ROBOTLASER1, ODOM and PARAM lines are used, others are\n  \
+      counted, and it is replayed in file order;\n\
+    - rosbag2's MCAP (a file, or the folder with metadata.yaml) and ROS 1 bags: scans, odometry\n  \
+      and transforms are used, in the order of their log times. Topics are found by type, or\n  \
+      named with --scan and --odom; frames are those of the configuration, or as the recorded\n  \
+      transforms tell them. What is damaged is told and passed over.\n\
     The same log, configuration and seed give the same map on any number of threads, and\n\
     the map and the path that gmapd run makes of the log when gmapd play sends it.\n\n\
     With --out DIR: map.pgm and map.yaml (nav2's map_server loads them), map.png (to look at),\n\
     trajectory.tum (evo opens it) and summary.json. Without, only the summary is printed.\n\n\
     Examples:\n  \
         gmapd replay intel.log --out out\n  \
+        gmapd replay run.bag --out out\n  \
+        gmapd replay rosbag2_2026_01_01/ --scan /front/scan --odom /odom --out out\n  \
+        gmapd replay run.mcap --expect 1f0a5c...   (the map's hash, as a replay prints it)\n  \
         gmapd replay intel.log.gz --config config/gmapd.yaml --set maxUrange=40 --out out\n  \
         gmapd replay intel.log --set particles=30 --set delta=0.1 --seed 7 --json")]
 pub(crate) struct Arguments {
     /// Recorded log
     log: PathBuf,
+    #[command(flatten)]
+    topics: TopicArguments,
     /// Configuration, or a parameter file of slam_gmapping; slam_gmapping's defaults without
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -54,6 +61,9 @@ pub(crate) struct Arguments {
     /// Threads of the filter; the result is the same for any number
     #[arg(long, value_name = "N", default_value = "1")]
     threads: NonZeroUsize,
+    /// Fail unless the map has this hash
+    #[arg(long, value_name = "HASH")]
+    expect: Option<String>,
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
@@ -61,15 +71,15 @@ pub(crate) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let config = load_config(arguments)?;
-    let log = CarmenLog::open(&arguments.log)?;
-    warn_about(log.statistics(), &arguments.log);
+    let log = Log::open(&arguments.log, &arguments.topics, &config)?;
+    log.warn(&arguments.log);
     if let Some(directory) = &arguments.out {
         std::fs::create_dir_all(directory)
             .with_context(|| format!("cannot make the directory {}", directory.display()))?;
     }
     let threads = arguments.threads.get();
     let watch = Stopwatch::start();
-    let outcome = replay(&log, Replay::new(&config, threads)?)?;
+    let outcome = replay(&log, &config, Replay::new(&config, threads)?)?;
     let elapsed = watch.elapsed();
 
     let products = Products::of(&outcome);
@@ -86,7 +96,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         written.push(path);
     }
     let text = if arguments.json { json(&summary)? } else { readable(&summary, &written) };
-    std::io::stdout().lock().write_all(text.as_bytes()).context("cannot print the summary")
+    std::io::stdout().lock().write_all(text.as_bytes()).context("cannot print the summary")?;
+    match &arguments.expect {
+        Some(expected) => check_hash(expected, &summary.sha256),
+        None => Ok(()),
+    }
 }
 
 fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
@@ -102,24 +116,46 @@ fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
     Ok(config)
 }
 
-fn warn_about(log: &LogStatistics, path: &Path) {
-    for malformed in log.first_malformed.iter().take(MALFORMED_SHOWN) {
-        eprintln!("warning: {}:{}: {}", path.display(), malformed.line, malformed.reason);
-    }
-    if log.malformed > MALFORMED_SHOWN as u64 {
-        eprintln!("warning: {} malformed lines in all", log.malformed);
-    }
-}
-
-fn replay(log: &CarmenLog, mut replay: Replay) -> anyhow::Result<Outcome> {
+fn replay(log: &Log, config: &Config, mut replay: Replay) -> anyhow::Result<Outcome> {
     let mut progress = Progress::new(log.statistics());
-    for reading in log.readings()? {
-        let reading = reading?;
-        replay.add(&reading);
-        progress.advance(reading.stamp);
+    match log {
+        Log::Carmen(log) => {
+            for reading in log.readings()? {
+                let reading = reading?;
+                replay.add(&reading);
+                progress.advance(reading.stamp);
+            }
+        }
+        Log::Recorded(recorded) => {
+            let mut refusals = Refusals::default();
+            for event in recorded.readings(config) {
+                match event {
+                    Event::Reading(reading) => {
+                        replay.add_received(&reading);
+                        progress.advance(reading.stamp);
+                    }
+                    Event::Refused(refusal) => {
+                        replay.refuse();
+                        refusals.add(refusal);
+                    }
+                }
+            }
+            refusals.warn();
+        }
     }
     progress.finish();
     Ok(replay.finish())
+}
+
+/// Fails if another map was expected; both hashes are told.
+fn check_hash(expected: &str, hashes: &Hashes) -> anyhow::Result<()> {
+    let found = hashes.map.as_deref().unwrap_or("no map");
+    ensure!(
+        found.eq_ignore_ascii_case(expected),
+        "the map is another: its SHA-256 is {found}, and {expected} was expected"
+    );
+    eprintln!("the map is as expected: {found}");
+    Ok(())
 }
 
 /// What is hashed even when it is not written.
@@ -236,7 +272,8 @@ fn readings(summary: &Summary) -> String {
         (counts.bad_geometry, "with bad geometry"),
         (counts.odometry_only, "odometry only"),
         (counts.jump_rejected, "jumps rejected"),
-        (counts.malformed, "malformed lines"),
+        (counts.refused, "refused"),
+        (counts.malformed, "malformed"),
     ];
     let mut text = format!("{}: {} processed", counts.total, counts.processed);
     for (count, name) in rare.into_iter().filter(|(count, _)| *count > 0) {

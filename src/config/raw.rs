@@ -42,6 +42,8 @@ pub struct RawConfig {
     pub save_directory: String,
     /// Name under which the map is saved when the daemon ends; left out, it is not.
     pub save_on_exit: Option<String>,
+    /// File to which inputs and outputs are recorded, MCAP; left out, they are not.
+    pub record: Option<String>,
 
     /// Readings strictly above are discarded, m; left out, the sensor's own limit.
     #[serde(rename = "maxRange")]
@@ -176,6 +178,7 @@ impl Default for RawConfig {
             scan_queue: 32,
             save_directory: "maps".to_owned(),
             save_on_exit: None,
+            record: None,
             max_range: core.max_range,
             max_usable_range: core.max_usable_range,
             beam_skip: core.matcher.beam_skip,

@@ -265,7 +265,7 @@ impl Mapper {
 
     fn make(&mut self, call: Call) {
         match call {
-            Call::Odometry(odom_from_base) => self.add_odometry(odom_from_base),
+            Call::Odometry(_, odom_from_base) => self.add_odometry(odom_from_base),
             Call::Scan(ready) if self.view.paused => {
                 self.add_odometry(ready.odom_from_base);
                 self.enter(Some(ready.scan.stamp), Verdict::Paused, String::new());

@@ -19,6 +19,7 @@ pub mod mapper;
 mod message_clock;
 mod outputs;
 mod queries;
+pub mod recorder;
 pub mod save;
 pub mod selector;
 pub mod serving;
@@ -46,6 +47,7 @@ use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
+use self::recorder::{Recorder, RecorderError};
 use self::save::{NameError, SaveName, Saver};
 use self::serving::{Serving, ServingError, Sources};
 use self::snapshot::{MapVersion, Snapshot, State};
@@ -95,6 +97,9 @@ pub enum DaemonError {
     /// Nothing can be published or answered.
     #[error(transparent)]
     Serving(#[from] ServingError),
+    /// What `record` asks for cannot be done.
+    #[error("record: {0}")]
+    Record(#[from] RecorderError),
     /// The filter's threads do not start.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
@@ -123,16 +128,48 @@ pub async fn run(
     settings: Settings,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), DaemonError> {
+    let mut recorder = record(&session, &settings).await?;
     let mut daemon = Daemon::start(&session, settings).await?;
     let ended = tokio::select! {
         () = shutdown => Ok(()),
         () = daemon.mapper_ended() => Err(DaemonError::MapperEnded),
     };
+    if let Some(recorder) = &mut recorder {
+        recorder.stop_inputs().await;
+    }
     daemon.stop().await;
+    if let Some(recorder) = recorder {
+        finish(recorder).await;
+    }
     // What it would still send is not worth waiting for; letting the session go could block.
     let closing = tokio::spawn(async move { session.close().await });
     tokio::time::timeout(CLOSE, closing).await.ok();
     ended
+}
+
+/// Begins to record, if the configuration asks for it.
+async fn record(
+    session: &zenoh::Session,
+    settings: &Settings,
+) -> Result<Option<Recorder>, DaemonError> {
+    let raw = &settings.config.raw;
+    let Some(path) = &raw.record else { return Ok(None) };
+    let keys = InputKeys::new(&settings.prefix, &raw.keys)?;
+    let recorder = Recorder::start(session, &settings.prefix, &keys, path.as_ref()).await?;
+    tracing::info!("recording to {}", recorder.unfinished().display());
+    Ok(Some(recorder))
+}
+
+async fn finish(recorder: Recorder) {
+    match tokio::time::timeout(DRAIN, recorder.finish()).await {
+        Ok(Ok(recorder::Recorded { path, messages, lost })) => {
+            tracing::info!("recorded {messages} messages to {}, {lost} lost", path.display());
+        }
+        Ok(Err(error)) => tracing::error!("the recording is not whole: {error}"),
+        Err(_) => {
+            tracing::warn!("the recording is not finished in time; it can be read all the same")
+        }
+    }
 }
 
 /// A daemon that runs.

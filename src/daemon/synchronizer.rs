@@ -68,8 +68,8 @@ pub struct FramedScan {
 /// What is to be done next.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Call {
-    /// The filter takes odometry.
-    Odometry(Pose2),
+    /// The filter takes odometry of a stamp.
+    Odometry(Stamp, Pose2),
     /// The filter takes a scan.
     Scan(ReadyScan),
     /// A scan does not reach the filter.
@@ -376,7 +376,7 @@ impl Synchronizer {
     fn feed(&mut self, until: Stamp) {
         for &(stamp, odom_from_base) in self.odometry.between(self.fed, until) {
             self.fed = Some(stamp);
-            self.calls.push_back(Call::Odometry(odom_from_base));
+            self.calls.push_back(Call::Odometry(stamp, odom_from_base));
         }
     }
 

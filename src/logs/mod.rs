@@ -1,11 +1,20 @@
 //! Recorded input, in the order it was recorded.
 //!
-//! A log is a sequence of [`Reading`]s. Its order, and not its stamps, says what came first:
+//! A log is a sequence of [`Reading`]s; recordings of ROS messages ([`recording`]) are made into
+//! one by [`crate::recorded`]. Its order, and not its stamps, says what came first:
 //! recordings exist whose stamps repeat and step back.
 
+mod bag;
 pub mod carmen;
 pub mod carmen_writer;
+mod cursor;
 mod lines;
+mod mcap;
+pub mod mcap_writer;
+pub mod recording;
+mod ros1;
+mod schemas;
+mod source;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -16,6 +25,7 @@ use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
 
 pub use lines::LineError;
+pub use source::{Damage, Fault};
 
 /// What a log says at one moment: where odometry believes the base is, and perhaps a sweep.
 #[derive(Debug, Clone, PartialEq)]

@@ -101,7 +101,9 @@ pub struct Counts {
     pub odometry_only: u64,
     /// Readings, whatever became of them, whose odometry step was rejected as a jump.
     pub jump_rejected: u64,
-    /// Lines that could not be read; not among `total`.
+    /// Scans of a recording without odometry or mount, late or twice; not among `total`.
+    pub refused: u64,
+    /// Lines or messages that could not be read; not among `total`.
     pub malformed: u64,
 }
 

@@ -75,7 +75,7 @@ impl Rig {
     /// `o` and `s` with the pose that the filter gets, or the verdict with the scan's stamp.
     fn told(&mut self) -> Vec<String> {
         let told = |call| match call {
-            Call::Odometry(pose) => format!("o{}", pose.x),
+            Call::Odometry(_, pose) => format!("o{}", pose.x),
             Call::Scan(ready) => format!("s{}", ready.odom_from_base.x),
             Call::Refuse(refusal) => {
                 let after = refusal.stamp.unwrap().seconds_since(stamp(0)) * 1e3;
@@ -88,7 +88,7 @@ impl Rig {
     fn details(&mut self) -> Vec<String> {
         let detail = |call| match call {
             Call::Refuse(refusal) => Some(refusal.detail),
-            Call::Odometry(_) | Call::Scan(_) => None,
+            Call::Odometry(..) | Call::Scan(_) => None,
         };
         self.calls().into_iter().filter_map(detail).collect()
     }

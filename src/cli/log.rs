@@ -1,0 +1,109 @@
+//! Opens what was recorded, whatever its format.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::ensure;
+use clap::Args;
+use gmapd::config::Config;
+use gmapd::daemon::ledger::Verdict;
+use gmapd::daemon::synchronizer::Refusal;
+use gmapd::logs::LogStatistics;
+use gmapd::logs::carmen::CarmenLog;
+use gmapd::logs::recording::{self, Format, Recording};
+use gmapd::recorded::{Recorded, Wanted};
+
+/// Malformed lines and damaged places that are told one by one.
+const FAULTS_SHOWN: usize = 10;
+
+/// Which topics of a recording are used.
+#[derive(Debug, Clone, Default, Args)]
+pub(super) struct TopicArguments {
+    /// Topic of the scans, where a recording has several
+    #[arg(long, value_name = "TOPIC")]
+    scan: Option<String>,
+    /// Topic of odometry, nav_msgs/Odometry or transforms, where a recording has several
+    #[arg(long, value_name = "TOPIC")]
+    odom: Option<String>,
+}
+
+/// A recorded run.
+pub(super) enum Log {
+    /// Readings, line by line.
+    Carmen(CarmenLog),
+    /// ROS messages.
+    Recorded(Box<Recorded>),
+}
+
+impl Log {
+    pub(super) fn open(
+        path: &Path,
+        topics: &TopicArguments,
+        config: &Config,
+    ) -> anyhow::Result<Self> {
+        let format = recording::format(path)?;
+        let wanted = Wanted { scan: topics.scan.clone(), odometry: topics.odom.clone() };
+        if format == Format::Carmen {
+            ensure!(
+                wanted == Wanted::default(),
+                "{} is a CARMEN log, which has no topics to choose with --scan and --odom",
+                path.display()
+            );
+            return Ok(Self::Carmen(CarmenLog::open(path)?));
+        }
+        let recording = Recording::new(path, format)?;
+        Ok(Self::Recorded(Box::new(Recorded::open(recording, path, &wanted, config)?)))
+    }
+
+    pub(super) const fn statistics(&self) -> &LogStatistics {
+        match self {
+            Self::Carmen(log) => log.statistics(),
+            Self::Recorded(recorded) => recorded.statistics(),
+        }
+    }
+
+    /// Tells what could not be read.
+    pub(super) fn warn(&self, path: &Path) {
+        match self {
+            Self::Carmen(log) => warn_about_lines(log.statistics(), path),
+            Self::Recorded(recorded) => {
+                for fault in recorded.faults().iter().take(FAULTS_SHOWN) {
+                    eprintln!("warning: {fault}; what can be read is used");
+                }
+                for rejected in recorded.rejected() {
+                    eprintln!("warning: {rejected}");
+                }
+            }
+        }
+    }
+}
+
+fn warn_about_lines(log: &LogStatistics, path: &Path) {
+    for malformed in log.first_malformed.iter().take(FAULTS_SHOWN) {
+        eprintln!("warning: {}:{}: {}", path.display(), malformed.line, malformed.reason);
+    }
+    if log.malformed > FAULTS_SHOWN as u64 {
+        eprintln!("warning: {} malformed lines in all", log.malformed);
+    }
+}
+
+/// Scans that did not reach the filter.
+#[derive(Debug, Default)]
+pub(super) struct Refusals {
+    /// How many, and what was said of the last.
+    by_verdict: BTreeMap<Verdict, (u64, String)>,
+}
+
+impl Refusals {
+    pub(super) fn add(&mut self, refusal: Refusal) {
+        let (count, detail) = self.by_verdict.entry(refusal.verdict).or_default();
+        *count += 1;
+        *detail = refusal.detail;
+    }
+
+    pub(super) fn warn(&self) {
+        for (count, detail) in self.by_verdict.values() {
+            eprintln!("warning: {count} scans could not be used; of the last of them: {detail}");
+        }
+    }
+}

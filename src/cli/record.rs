@@ -1,0 +1,97 @@
+//! `gmapd record`: what a robot sends, and what gmapd makes of it, to a file.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::Args;
+use gmapd::config::Keys;
+use gmapd::daemon::input::Input;
+use gmapd::daemon::keys::{InputKeys, Prefix};
+use gmapd::daemon::recorder::Recorder;
+use serde::Deserialize;
+use tokio::signal::unix::{SignalKind, signal};
+use zenoh::Session;
+
+use super::mesh;
+use super::session::SessionArguments;
+
+/// Whom to record, and where to.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+    Records scan, odom, tf and tf_static, and what gmapd run publishes: map, map_metadata, pose,\n\
+    particlecloud, path, entropy, diagnostics and tf. Ctrl-C or SIGTERM ends it.\n\n\
+    The file is MCAP as rosbag2 writes it: ros2 bag, Foxglove and gmapd replay open it. Until it\n\
+    ends it is called FILE.part, which gmapd replay reads, too, after a crash. A file that is there\n\
+    is not touched: the new one gets a number.\n\n\
+    Examples:\n  \
+        gmapd record robot01 -o run.mcap\n  \
+        gmapd replay run.mcap --out out")]
+pub(crate) struct Arguments {
+    /// Whom to record: what the robot's keys begin with; without, the only robot that is alive
+    robot: Option<String>,
+    /// The file
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    #[command(flatten)]
+    session: SessionArguments,
+}
+
+/// What is used of a daemon's status.
+#[derive(Deserialize)]
+struct Status {
+    inputs: BTreeMap<String, InputStatus>,
+}
+
+#[derive(Deserialize)]
+struct InputStatus {
+    key: String,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    mesh::block_on(async {
+        let mut terminate = signal(SignalKind::terminate()).context("no signals come")?;
+        let session = arguments.session.open().await?;
+        let robot = mesh::choose(&session, arguments.robot.as_deref()).await?;
+        let keys = input_keys(&session, &robot).await?;
+        let recorder = Recorder::start(&session, &robot, &keys, &arguments.output).await?;
+        eprintln!(
+            "recording {} to {}; Ctrl-C ends it",
+            mesh::name(&robot),
+            recorder.unfinished().display()
+        );
+        tokio::select! {
+            signal = tokio::signal::ctrl_c() => signal.context("no signals come")?,
+            _ = terminate.recv() => {}
+        }
+        let recorded = recorder.finish().await?;
+        println!("recorded {} messages to {}", recorded.messages, recorded.path.display());
+        if recorded.lost > 0 {
+            eprintln!("warning: {} messages are not in it", recorded.lost);
+        }
+        session.close().await.ok();
+        Ok(())
+    })
+}
+
+/// The keys that the robot's daemon tells, or without a daemon those of its defaults.
+async fn input_keys(session: &Session, robot: &Prefix) -> anyhow::Result<InputKeys> {
+    let status = robot.key("slam/status")?.to_string();
+    let mut names = Keys::default();
+    let Some(answer) = mesh::ask(session, &status).await? else {
+        return Ok(InputKeys::new(robot, &names)?);
+    };
+    let status: Status = serde_json::from_slice(&answer.bytes)
+        .with_context(|| format!("what answers on {status} is no gmapd"))?;
+    let told = |input: Input, name: &mut String| {
+        if let Some(input) = status.inputs.get(input.name()) {
+            name.clone_from(&input.key);
+        }
+    };
+    told(Input::Scan, &mut names.scan);
+    told(Input::Odom, &mut names.odom);
+    told(Input::Tf, &mut names.tf);
+    told(Input::TfStatic, &mut names.tf_static);
+    // These are whole keys already.
+    Ok(InputKeys::new(&Prefix::parse("")?, &names)?)
+}
