@@ -4,7 +4,6 @@ use thiserror::Error;
 use zenoh::key_expr::{KeyExpr, OwnedKeyExpr};
 
 use super::input::Input;
-use crate::config::Keys;
 
 /// What every key of a robot begins with.
 ///
@@ -26,6 +25,12 @@ pub enum KeyError {
     /// It stands for many keys.
     #[error("{0:?} has a wildcard; the keys of one robot are needed, as in robot01")]
     Wildcard(String),
+    /// ROS 2 could not name it.
+    #[error(
+        "{0:?} is no ROS 2 name, which interop: rmw_zenoh needs: words of letters, digits and _, \
+         with / between"
+    )]
+    NotRosName(String),
 }
 
 impl Prefix {
@@ -63,13 +68,10 @@ pub struct InputKeys {
 }
 
 impl InputKeys {
-    /// The configured names under the prefix.
-    ///
-    /// # Errors
-    /// When one of them is not part of a key or has wildcards.
-    pub fn new(prefix: &Prefix, names: &Keys) -> Result<Self, KeyError> {
-        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| prefix.key(name(names, input)));
-        Ok(Self { keys: [scan?, odom?, tf?, tf_static?] })
+    /// The keys of [`Input::ALL`], in that order.
+    #[must_use]
+    pub const fn new(keys: [OwnedKeyExpr; Input::ALL.len()]) -> Self {
+        Self { keys }
     }
 
     /// The key of an input.
@@ -85,25 +87,20 @@ impl InputKeys {
     }
 }
 
-fn name(names: &Keys, input: Input) -> &str {
-    match input {
-        Input::Scan => &names.scan,
-        Input::Odom => &names.odom,
-        Input::Tf => &names.tf,
-        Input::TfStatic => &names.tf_static,
-    }
-}
-
 fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
     // Zenoh would call `robot*` malformed, and say no word of wildcards.
     if text.contains('*') {
         return Err(KeyError::Wildcard(text.to_owned()));
     }
-    let key = KeyExpr::autocanonize(text.to_owned()).map_err(|error| KeyError::Invalid {
-        key: text.to_owned(),
-        reason: plain_message(&error),
-    })?;
-    Ok(key.into())
+    key_expression(text.to_owned())
+}
+
+/// A key, or many with wildcards.
+pub(super) fn key_expression(text: String) -> Result<OwnedKeyExpr, KeyError> {
+    match KeyExpr::autocanonize(text.clone()) {
+        Ok(key) => Ok(key.into()),
+        Err(error) => Err(KeyError::Invalid { key: text, reason: plain_message(&error) }),
+    }
 }
 
 /// What Zenoh says is wrong, without the place in its sources where it noticed.
@@ -117,18 +114,6 @@ pub fn plain_message(error: &zenoh::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn inputs_can_be_renamed() {
-        let names = Keys { scan: "front/scan".to_owned(), ..Keys::default() };
-        let keys = InputKeys::new(&Prefix::parse("robot01").unwrap(), &names).unwrap();
-        let keys = Input::ALL.map(|input| keys.of(input).to_string());
-        let expected = ["robot01/front/scan", "robot01/odom", "robot01/tf", "robot01/tf_static"];
-        assert_eq!(keys, expected);
-        let names = Keys { odom: "*".to_owned(), ..Keys::default() };
-        let error = InputKeys::new(&Prefix::parse("").unwrap(), &names).unwrap_err();
-        assert_eq!(error, KeyError::Wildcard("*".to_owned()));
-    }
 
     #[test]
     fn keys_are_under_the_prefix() {

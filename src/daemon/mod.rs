@@ -19,6 +19,7 @@ pub mod mapper;
 mod message_clock;
 mod outputs;
 mod queries;
+pub mod ros_node;
 pub mod save;
 pub mod selector;
 pub mod serving;
@@ -45,6 +46,7 @@ use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
+use self::ros_node::{Convention, RosNode};
 use self::save::{NameError, SaveName, Saver};
 use self::serving::{Serving, ServingError, Sources};
 use self::snapshot::{Snapshot, State};
@@ -175,7 +177,9 @@ impl Daemon {
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
         let exit_name = config.raw.save_on_exit.as_deref().map(SaveName::parse).transpose()?;
-        let keys = InputKeys::new(&prefix, &config.raw.keys)?;
+        let convention = Convention::new(&config.raw);
+        let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
+        let keys = node.inputs(&config.raw.keys)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
@@ -210,7 +214,7 @@ impl Daemon {
         };
         let saving = Saving::new(&config, exit_name);
         let served = serving::Settings::new(&config, saving.directory());
-        let serving = Serving::start(session, &prefix, served, sources).await?;
+        let serving = Serving::start(session, node, served, sources).await?;
         let subscribers = subscribe(session, &keys, &inbox).await?;
         tell_keys(&keys);
         Ok(Self {
