@@ -79,7 +79,7 @@ async fn input_keys(session: &Session, robot: &Prefix) -> anyhow::Result<InputKe
     let status = robot.key("slam/status")?.to_string();
     let mut names = Keys::default();
     let Some(answer) = mesh::ask(session, &status).await? else {
-        return Ok(InputKeys::new(robot, &names)?);
+        return Ok(InputKeys::under(robot, &names)?);
     };
     let status: Status = serde_json::from_slice(&answer.bytes)
         .with_context(|| format!("what answers on {status} is no gmapd"))?;
@@ -93,5 +93,5 @@ async fn input_keys(session: &Session, robot: &Prefix) -> anyhow::Result<InputKe
     told(Input::Tf, &mut names.tf);
     told(Input::TfStatic, &mut names.tf_static);
     // These are whole keys already.
-    Ok(InputKeys::new(&Prefix::parse("")?, &names)?)
+    Ok(InputKeys::under(&Prefix::parse("")?, &names)?)
 }

@@ -12,7 +12,9 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-pub use raw::{Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, Smoothing};
+pub use raw::{
+    Interop, Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, RosDistro, Smoothing,
+};
 pub use source::Origin;
 
 use crate::slam::gmapping::{

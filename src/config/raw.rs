@@ -32,6 +32,12 @@ pub struct RawConfig {
     pub prefix: String,
     /// The inputs' keys under the prefix.
     pub keys: Keys,
+    /// How ROS 2 nodes are met.
+    pub interop: Interop,
+    /// The domain of ROS 2 nodes on `rmw_zenoh`.
+    pub ros_domain_id: u32,
+    /// The distribution of ROS 2 nodes on `rmw_zenoh`.
+    pub ros_distro: RosDistro,
     /// Where odometry comes from.
     pub odometry_source: OdometrySource,
     /// Seconds that a scan waits for its odometry.
@@ -173,6 +179,9 @@ impl Default for RawConfig {
             tf_delay: None,
             prefix: String::new(),
             keys: Keys::default(),
+            interop: Interop::Bridge,
+            ros_domain_id: 0,
+            ros_distro: RosDistro::Jazzy,
             odometry_source: OdometrySource::Auto,
             odometry_timeout_s: 0.5,
             scan_queue: 32,
@@ -258,6 +267,28 @@ impl Default for Keys {
             tf_static: "tf_static".to_owned(),
         }
     }
+}
+
+/// How ROS 2 nodes are met.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Interop {
+    /// Through `zenoh-bridge-ros2dds`, to which topics and services are announced.
+    Bridge,
+    /// They run on `rmw_zenoh`: its keys, attachments and announcements.
+    RmwZenoh,
+    /// Not at all.
+    None,
+}
+
+/// Which types' hashes ROS 2 nodes on `rmw_zenoh` know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RosDistro {
+    /// Jazzy and all later: all.
+    Jazzy,
+    /// None.
+    Humble,
 }
 
 /// Where odometry comes from.

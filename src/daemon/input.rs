@@ -12,8 +12,10 @@ use super::ledger::Verdict;
 use super::mailbox::{Mail, Mailbox};
 use super::synchronizer::{FramedScan, Refusal};
 use crate::clock;
+use crate::config::Keys;
 use crate::convert;
 use crate::ros;
+use crate::ros::graph::{LASER_SCAN, ODOMETRY, TF_MESSAGE, WireType};
 use crate::slam::pose::Stamp;
 use crate::tf::Kind;
 
@@ -54,6 +56,26 @@ impl Input {
             Self::Odom => "odom",
             Self::Tf => "tf",
             Self::TfStatic => "tf_static",
+        }
+    }
+
+    /// What it carries.
+    #[must_use]
+    pub const fn wire_type(self) -> WireType {
+        match self {
+            Self::Scan => LASER_SCAN,
+            Self::Odom => ODOMETRY,
+            Self::Tf | Self::TfStatic => TF_MESSAGE,
+        }
+    }
+
+    /// Its key under the prefix.
+    pub(super) fn key_in(self, keys: &Keys) -> &str {
+        match self {
+            Self::Scan => &keys.scan,
+            Self::Odom => &keys.odom,
+            Self::Tf => &keys.tf,
+            Self::TfStatic => &keys.tf_static,
         }
     }
 

@@ -26,6 +26,12 @@ pub enum KeyError {
     /// It stands for many keys.
     #[error("{0:?} has a wildcard; the keys of one robot are needed, as in robot01")]
     Wildcard(String),
+    /// ROS 2 could not name it.
+    #[error(
+        "{0:?} is no ROS 2 name, which interop: rmw_zenoh needs: words of letters, digits and _, \
+         with / between"
+    )]
+    NotRosName(String),
 }
 
 impl Prefix {
@@ -63,13 +69,19 @@ pub struct InputKeys {
 }
 
 impl InputKeys {
-    /// The configured names under the prefix.
+    /// The keys of [`Input::ALL`], in that order.
+    #[must_use]
+    pub const fn new(keys: [OwnedKeyExpr; Input::ALL.len()]) -> Self {
+        Self { keys }
+    }
+
+    /// The configured names under the prefix, as they are without ROS 2's own keys.
     ///
     /// # Errors
     /// When one of them is not part of a key or has wildcards.
-    pub fn new(prefix: &Prefix, names: &Keys) -> Result<Self, KeyError> {
-        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| prefix.key(name(names, input)));
-        Ok(Self { keys: [scan?, odom?, tf?, tf_static?] })
+    pub fn under(prefix: &Prefix, names: &Keys) -> Result<Self, KeyError> {
+        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| prefix.key(input.key_in(names)));
+        Ok(Self::new([scan?, odom?, tf?, tf_static?]))
     }
 
     /// The key of an input.
@@ -85,25 +97,20 @@ impl InputKeys {
     }
 }
 
-fn name(names: &Keys, input: Input) -> &str {
-    match input {
-        Input::Scan => &names.scan,
-        Input::Odom => &names.odom,
-        Input::Tf => &names.tf,
-        Input::TfStatic => &names.tf_static,
-    }
-}
-
 fn literal_key(text: &str) -> Result<OwnedKeyExpr, KeyError> {
     // Zenoh would call `robot*` malformed, and say no word of wildcards.
     if text.contains('*') {
         return Err(KeyError::Wildcard(text.to_owned()));
     }
-    let key = KeyExpr::autocanonize(text.to_owned()).map_err(|error| KeyError::Invalid {
-        key: text.to_owned(),
-        reason: plain_message(&error),
-    })?;
-    Ok(key.into())
+    key_expression(text.to_owned())
+}
+
+/// A key, or many with wildcards.
+pub(super) fn key_expression(text: String) -> Result<OwnedKeyExpr, KeyError> {
+    match KeyExpr::autocanonize(text.clone()) {
+        Ok(key) => Ok(key.into()),
+        Err(error) => Err(KeyError::Invalid { key: text, reason: plain_message(&error) }),
+    }
 }
 
 /// What Zenoh says is wrong, without the places in its sources where it noticed.
@@ -129,18 +136,6 @@ fn without_places(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn inputs_can_be_renamed() {
-        let names = Keys { scan: "front/scan".to_owned(), ..Keys::default() };
-        let keys = InputKeys::new(&Prefix::parse("robot01").unwrap(), &names).unwrap();
-        let keys = Input::ALL.map(|input| keys.of(input).to_string());
-        let expected = ["robot01/front/scan", "robot01/odom", "robot01/tf", "robot01/tf_static"];
-        assert_eq!(keys, expected);
-        let names = Keys { odom: "*".to_owned(), ..Keys::default() };
-        let error = InputKeys::new(&Prefix::parse("").unwrap(), &names).unwrap_err();
-        assert_eq!(error, KeyError::Wildcard("*".to_owned()));
-    }
 
     #[test]
     fn messages_do_not_say_where_in_the_sources_they_arose() {

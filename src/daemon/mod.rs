@@ -20,6 +20,7 @@ mod message_clock;
 mod outputs;
 mod queries;
 pub mod recorder;
+pub mod ros_node;
 pub mod save;
 pub mod selector;
 pub mod serving;
@@ -48,6 +49,7 @@ use self::ledger::Entry;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
 use self::recorder::{Recorder, RecorderError};
+use self::ros_node::{Convention, RosNode};
 use self::save::{NameError, SaveName, Saver};
 use self::serving::{Serving, ServingError, Sources};
 use self::snapshot::{MapVersion, Snapshot, State};
@@ -154,7 +156,8 @@ async fn record(
 ) -> Result<Option<Recorder>, DaemonError> {
     let raw = &settings.config.raw;
     let Some(path) = &raw.record else { return Ok(None) };
-    let keys = InputKeys::new(&settings.prefix, &raw.keys)?;
+    let (id, prefix) = (session.zid().to_string(), settings.prefix.clone());
+    let keys = RosNode::new(id, prefix, Convention::new(raw)).inputs(&raw.keys)?;
     let recorder = Recorder::start(session, &settings.prefix, &keys, path.as_ref()).await?;
     tracing::info!("recording to {}", recorder.unfinished().display());
     Ok(Some(recorder))
@@ -213,7 +216,9 @@ impl Daemon {
     /// When a key cannot be used, or a thread does not start.
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
-        let keys = InputKeys::new(&prefix, &config.raw.keys)?;
+        let convention = Convention::new(&config.raw);
+        let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
+        let keys = node.inputs(&config.raw.keys)?;
         let mut daemon = Self::deaf(&config, &keys, threads)?;
         let sources = Sources {
             snapshots: daemon.snapshots(),
@@ -222,7 +227,7 @@ impl Daemon {
             status: asked(&daemon.status),
         };
         let served = serving::Settings::new(&config, daemon.saving.directory());
-        daemon.serving = Some(Serving::start(session, &prefix, served, sources).await?);
+        daemon.serving = Some(Serving::start(session, node, served, sources).await?);
         daemon.subscribers = Some(subscribe(session, &keys, &daemon.inbox).await?);
         tell_keys(&keys);
         Ok(daemon)

@@ -19,18 +19,22 @@ use zenoh_ext::{
     AdvancedPublisher, AdvancedPublisherBuilderExt as _, CacheConfig, MissDetectionConfig,
 };
 
-use super::answers::{cdr_of, particle_cloud, pose_message};
+use super::answers::{particle_cloud, pose_message};
 use super::diagnostics::diagnostics;
 use super::formats::{MapProducts, ProductCache};
-use super::keys::Prefix;
 use super::ledger::Entry;
 use super::message_clock::MessageClock;
+use super::ros_node::{Output, RosNode, Signature};
 use super::selector::{MessageFormat, PathFormat};
 use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
 use crate::clock::Stopwatch;
 use crate::convert;
 use crate::ros;
+use crate::ros::graph::{
+    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, PATH, POSE_ARRAY,
+    POSE_WITH_COVARIANCE_STAMPED, Qos, TF_MESSAGE, WireType,
+};
 use crate::slam::pose::Pose2;
 
 /// How often it is looked whether somebody takes the map, beside being told: who leaves and comes
@@ -47,22 +51,25 @@ type Snapshots = watch::Receiver<Arc<Snapshot>>;
 /// Declares publishers and starts the tasks that use them.
 pub(super) struct Declare<'a> {
     pub(super) session: &'a Session,
-    pub(super) prefix: &'a Prefix,
+    /// Learns of each publisher of messages.
+    pub(super) node: &'a mut RosNode,
 }
 
 impl Declare<'_> {
     /// `map`, `map_metadata` and `path`, which change with the version of the map.
     pub(super) async fn maps(
-        &self,
+        &mut self,
         settings: &Settings,
         snapshots: &Snapshots,
         products: &Arc<ProductCache>,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
         for kind in [Retained::Map, Retained::Metadata, Retained::Path] {
+            let (publisher, signature) = self.retaining(kind).await?;
             let output = RetainedOutput {
                 kind,
-                publisher: Arc::new(self.retaining(kind).await?),
+                publisher: Arc::new(publisher),
+                signature,
                 products: products.clone(),
                 interval: settings.map_update_interval,
             };
@@ -73,15 +80,15 @@ impl Declare<'_> {
 
     /// `pose`, `entropy` and `particlecloud`.
     pub(super) async fn estimates(
-        &self,
+        &mut self,
         settings: &Settings,
         snapshots: &Snapshots,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
         let outputs = EstimateOutputs {
-            pose: self.prompt("pose", cdr_of::<ros::PoseWithCovarianceStamped>()).await?,
-            entropy: self.plain("entropy", cdr_of::<ros::Float64>()).await?,
-            particles: self.plain("particlecloud", cdr_of::<ros::PoseArray>()).await?,
+            pose: self.prompt("pose", POSE_WITH_COVARIANCE_STAMPED, Qos::reliable(10)).await?,
+            entropy: self.plain("entropy", FLOAT64).await?,
+            particles: self.plain("particlecloud", POSE_ARRAY).await?,
             map_frame: settings.map_frame.clone(),
             period: settings.transform_publish_period,
         };
@@ -91,13 +98,13 @@ impl Declare<'_> {
 
     /// `tf`, unless it is switched off.
     pub(super) async fn transform(
-        &self,
+        &mut self,
         settings: Settings,
         snapshots: Snapshots,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
         if !settings.transform_publish_period.is_zero() {
-            let publisher = self.prompt("tf", cdr_of::<ros::TfMessage>()).await?;
+            let publisher = self.prompt("tf", TF_MESSAGE, Qos::reliable(100)).await?;
             tasks.spawn(publish_transform(publisher, settings, snapshots));
         }
         Ok(())
@@ -105,12 +112,12 @@ impl Declare<'_> {
 
     /// `diagnostics`.
     pub(super) async fn diagnostics(
-        &self,
+        &mut self,
         status: AskStatus,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
-        let publisher = self.plain("diagnostics", cdr_of::<ros::DiagnosticArray>()).await?;
-        tasks.spawn(publish_diagnostics(publisher, self.prefix.to_string(), status));
+        let publisher = self.plain("diagnostics", DIAGNOSTIC_ARRAY).await?;
+        tasks.spawn(publish_diagnostics(publisher, self.node.prefix().to_string(), status));
         Ok(())
     }
 
@@ -120,7 +127,7 @@ impl Declare<'_> {
         verdicts: broadcast::Receiver<Entry>,
         tasks: &mut JoinSet<()>,
     ) -> Result<(), ServingError> {
-        let key = self.prefix.key("slam/verdict")?;
+        let key = self.node.prefix().key("slam/verdict")?;
         let publisher = self
             .session
             .declare_publisher(key.clone())
@@ -134,34 +141,42 @@ impl Declare<'_> {
 
     /// A publisher of small messages; of those that do not fit, the newest is dropped.
     async fn plain(
-        &self,
-        name: &str,
-        encoding: Encoding,
-    ) -> Result<Publisher<'static>, ServingError> {
-        let key = self.prefix.key(name)?;
+        &mut self,
+        name: &'static str,
+        wire_type: WireType,
+    ) -> Result<MessagePublisher, ServingError> {
+        let output = self.node.output(name, wire_type, Qos::reliable(10))?;
+        let Output { key, encoding, signature } = output;
         let publisher = self.session.declare_publisher(key.clone()).encoding(encoding);
-        declared(key, publisher.congestion_control(CongestionControl::Drop).await)
+        let publisher = publisher.congestion_control(CongestionControl::Drop).await;
+        Ok(MessagePublisher { name, publisher: declared(key, publisher)?, signature })
     }
 
     /// As [`Self::plain`], for messages that are of use at once or never.
     async fn prompt(
-        &self,
-        name: &str,
-        encoding: Encoding,
-    ) -> Result<Publisher<'static>, ServingError> {
-        let key = self.prefix.key(name)?;
+        &mut self,
+        name: &'static str,
+        wire_type: WireType,
+        qos: Qos,
+    ) -> Result<MessagePublisher, ServingError> {
+        let Output { key, encoding, signature } = self.node.output(name, wire_type, qos)?;
         let publisher = self.session.declare_publisher(key.clone()).encoding(encoding);
         let publisher = publisher.congestion_control(CongestionControl::Drop).express(true);
-        declared(key, publisher.priority(Priority::InteractiveHigh).await)
+        let publisher = publisher.priority(Priority::InteractiveHigh).await;
+        Ok(MessagePublisher { name, publisher: declared(key, publisher)?, signature })
     }
 
     /// A publisher whose last sample is kept for who comes later, as ROS' transient local is.
-    async fn retaining(&self, kind: Retained) -> Result<AdvancedPublisher<'static>, ServingError> {
-        let key = self.prefix.key(kind.name())?;
+    async fn retaining(
+        &mut self,
+        kind: Retained,
+    ) -> Result<(AdvancedPublisher<'static>, Signature), ServingError> {
+        let output = self.node.output(kind.name(), kind.wire_type(), Qos::latched(1))?;
+        let Output { key, encoding, signature } = output;
         let publisher = self
             .session
             .declare_publisher(key.clone())
-            .encoding(kind.encoding())
+            .encoding(encoding)
             // A map goes out in pieces. Those that may be dropped are, and then none of it arrives;
             // this one waits for its place, and only the next is dropped meanwhile.
             .congestion_control(CongestionControl::BlockFirst)
@@ -170,12 +185,30 @@ impl Declare<'_> {
             .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
             .publisher_detection()
             .await;
-        declared(key, publisher)
+        Ok((declared(key, publisher)?, signature))
     }
 }
 
 fn declared<P>(key: OwnedKeyExpr, publisher: Result<P, zenoh::Error>) -> Result<P, ServingError> {
     publisher.map_err(|source| ServingError::Declare { key, source })
+}
+
+/// Publishes messages of one type.
+struct MessagePublisher {
+    name: &'static str,
+    publisher: Publisher<'static>,
+    signature: Signature,
+}
+
+impl MessagePublisher {
+    async fn put<M: ros::Message>(&self, message: &M) {
+        let put = self.publisher.put(ros::cdr(message)).attachment(self.signature.next());
+        tell(self.name, put.await);
+    }
+
+    async fn is_wanted(&self) -> bool {
+        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+    }
 }
 
 /// What is kept for subscribers that come later.
@@ -195,11 +228,11 @@ impl Retained {
         }
     }
 
-    fn encoding(self) -> Encoding {
+    const fn wire_type(self) -> WireType {
         match self {
-            Self::Map => cdr_of::<ros::OccupancyGrid>(),
-            Self::Metadata => cdr_of::<ros::MapMetaData>(),
-            Self::Path => cdr_of::<ros::Path>(),
+            Self::Map => OCCUPANCY_GRID,
+            Self::Metadata => MAP_META_DATA,
+            Self::Path => PATH,
         }
     }
 
@@ -228,6 +261,7 @@ impl Retained {
 struct RetainedOutput {
     kind: Retained,
     publisher: Arc<AdvancedPublisher<'static>>,
+    signature: Signature,
     products: Arc<ProductCache>,
     interval: Duration,
 }
@@ -273,10 +307,12 @@ impl RetainedOutput {
     /// Puts a version whose content is not `last`; returns the content that was put last.
     async fn put(&self, products: Arc<MapProducts>, last: Option<String>) -> Option<String> {
         let (kind, publisher) = (self.kind, self.publisher.clone());
+        let signature = self.signature.clone();
         let put = move || {
             let content = kind.content(&products);
             if last.as_ref() != Some(&content) {
-                tell(kind.name(), publisher.put(kind.encode(&products)).wait());
+                let put = publisher.put(kind.encode(&products)).attachment(signature.next());
+                tell(kind.name(), put.wait());
             }
             Some(content)
         };
@@ -286,9 +322,9 @@ impl RetainedOutput {
 
 /// Publishes where the robot is, and what the particles think.
 struct EstimateOutputs {
-    pose: Publisher<'static>,
-    entropy: Publisher<'static>,
-    particles: Publisher<'static>,
+    pose: MessagePublisher,
+    entropy: MessagePublisher,
+    particles: MessagePublisher,
     map_frame: String,
     /// Between two publications at least.
     period: Duration,
@@ -305,7 +341,7 @@ impl EstimateOutputs {
             let now = (estimate.stamp, estimate.pose_in_map);
             let is_new = last.replace(now) != Some(now);
             if is_new && let Some(pose) = pose_message(estimate, &self.map_frame) {
-                tell("pose", self.pose.put(ros::cdr(&pose)).await);
+                self.pose.put(&pose).await;
             }
             // With every processed scan the particles are other ones.
             if !Arc::ptr_eq(&particles, &estimate.particles) && !estimate.particles.is_empty() {
@@ -321,19 +357,17 @@ impl EstimateOutputs {
     async fn put_particles(&self, snapshot: &Snapshot) {
         let estimate = &snapshot.estimate;
         if let Some(report) = &estimate.report {
-            let entropy = ros::Float64 { data: report.entropy };
-            tell("entropy", self.entropy.put(ros::cdr(&entropy)).await);
+            self.entropy.put(&ros::Float64 { data: report.entropy }).await;
         }
-        if self.particles.matching_status().await.is_ok_and(|status| status.matching()) {
-            let cloud = particle_cloud(estimate, &self.map_frame);
-            tell("particlecloud", self.particles.put(ros::cdr(&cloud)).await);
+        if self.particles.is_wanted().await {
+            self.particles.put(&particle_cloud(estimate, &self.map_frame)).await;
         }
     }
 }
 
 /// Sends map to odom in steady steps, whether or not scans come: odometry goes on without them.
 async fn publish_transform(
-    publisher: Publisher<'static>,
+    publisher: MessagePublisher,
     settings: Settings,
     mut snapshots: Snapshots,
 ) {
@@ -360,19 +394,19 @@ async fn publish_transform(
                 let transform =
                     convert::transform_stamped(header, &settings.odom_frame, map_from_odom);
                 let message = ros::TfMessage { transforms: vec![transform] };
-                tell("tf", publisher.put(ros::cdr(&message)).await);
+                publisher.put(&message).await;
             }
         }
     }
 }
 
-async fn publish_diagnostics(publisher: Publisher<'static>, robot: String, status: AskStatus) {
+async fn publish_diagnostics(publisher: MessagePublisher, robot: String, status: AskStatus) {
     let mut ticks = tokio::time::interval(DIAGNOSTICS_PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
         ticks.tick().await;
         let message = diagnostics(&status.status(), &robot);
-        tell("diagnostics", publisher.put(ros::cdr(&message)).await);
+        publisher.put(&message).await;
     }
 }
 

@@ -11,9 +11,12 @@ use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait as _};
 
 use super::answers::{Answer, Refusal, Responder};
-use super::keys::Prefix;
+use super::ros_node::RosNode;
 use super::selector::Topic;
 use super::serving::ServingError;
+use crate::clock;
+use crate::ros::graph::GET_MAP;
+use crate::ros::graph::rmw_zenoh::Attachment;
 
 /// Queries that are answered at once. A reply to a slow client holds its place until it is sent.
 const ANSWERS_AT_ONCE: usize = 64;
@@ -26,6 +29,15 @@ const REFUSALS_WAITING: usize = 1024;
 
 /// Bytes of parameters that a query may have to wait for that.
 const LONGEST_WAITING: usize = 1024;
+
+/// Who asks on a key, and so what a reply has to bring.
+#[derive(Debug, Clone, Copy)]
+enum Asker {
+    /// Anybody.
+    Mesh,
+    /// A client of a ROS 2 service, by `rmw_zenoh`: its request's number and its own id.
+    RosNode,
+}
 
 /// What a robot answers, while this lives.
 #[derive(Debug)]
@@ -49,10 +61,10 @@ struct Counter {
 }
 
 impl Queryables {
-    /// Declares the queryable of each topic.
+    /// Declares the queryable of each topic, and that of the service as ROS 2 nodes ask it.
     pub(super) async fn declare(
         session: &Session,
-        prefix: &Prefix,
+        node: &mut RosNode,
         responder: Arc<Responder>,
     ) -> Result<Self, ServingError> {
         let (refused, waiting) = mpsc::channel(REFUSALS_WAITING);
@@ -65,15 +77,12 @@ impl Queryables {
         };
         let mut declared = Vec::new();
         for topic in Topic::ALL {
-            let key = prefix.key(topic.name())?;
-            let counter = counter.clone();
-            let own_key = key.clone();
-            let queryable = session
-                .declare_queryable(key.clone())
-                .complete(true)
-                .callback(move |query| counter.take(topic, own_key.clone(), query))
-                .await;
-            declared.push(queryable.map_err(|source| ServingError::Declare { key, source })?);
+            let key = node.prefix().key(topic.name())?;
+            declared.push(counter.declare(session, topic, key, Asker::Mesh).await?);
+        }
+        let topic = Topic::DynamicMap;
+        if let Some(key) = node.service(topic.name(), GET_MAP)? {
+            declared.push(counter.declare(session, topic, key, Asker::RosNode).await?);
         }
         let refusals = tokio::spawn(refuse_all(waiting));
         Ok(Self { declared, counter, refusals })
@@ -98,7 +107,23 @@ impl Queryables {
 }
 
 impl Counter {
-    fn take(&self, topic: Topic, key: OwnedKeyExpr, mut query: Query) {
+    async fn declare(
+        &self,
+        session: &Session,
+        topic: Topic,
+        key: OwnedKeyExpr,
+        asker: Asker,
+    ) -> Result<Queryable<()>, ServingError> {
+        let (counter, own_key) = (self.clone(), key.clone());
+        let queryable = session
+            .declare_queryable(key.clone())
+            .complete(true)
+            .callback(move |query| counter.take(topic, own_key.clone(), asker, query))
+            .await;
+        queryable.map_err(|source| ServingError::Declare { key, source })
+    }
+
+    fn take(&self, topic: Topic, key: OwnedKeyExpr, asker: Asker, mut query: Query) {
         // No answer depends on it, and it may be large.
         if let Some(payload) = query.payload_mut() {
             *payload = ZBytes::new();
@@ -113,11 +138,27 @@ impl Counter {
         };
         let responder = self.responder.clone();
         self.runtime.spawn_blocking(move || {
-            reply(&query, &key, answer(&responder, topic, &query));
+            let answer = answer(&responder, topic, &query);
+            let answer = answer.map(|answer| asker.sign(answer, &query));
+            reply(&query, &key, answer);
             // Whoever asked is told that nothing more comes before the place is free again.
             drop(query);
             drop(place);
         });
+    }
+}
+
+impl Asker {
+    /// A node takes the reply to its own request only. Who asks without an attachment is no node.
+    fn sign(self, answer: Answer, query: &Query) -> Answer {
+        let attachment = match self {
+            Self::Mesh => return answer,
+            Self::RosNode => query.attachment().map(|bytes| bytes.to_bytes()),
+        };
+        let request = attachment.and_then(|bytes| Attachment::from_bytes(&bytes));
+        let reply =
+            request.map(|request| Attachment { sent_ns: clock::unix_nanoseconds(), ..request });
+        Answer { attachment: reply.map(|reply| reply.to_bytes().to_vec().into()), ..answer }
     }
 }
 

@@ -14,10 +14,11 @@ use zenoh::{Session, Wait as _};
 
 use super::answers::Responder;
 use super::command::Request;
-use super::keys::{KeyError, Prefix};
+use super::keys::KeyError;
 use super::ledger::Entry;
 use super::outputs;
 use super::queries::Queryables;
+use super::ros_node::RosNode;
 use super::snapshot::Snapshot;
 use super::status::Status;
 use crate::config::Config;
@@ -126,50 +127,57 @@ pub enum ServingError {
 #[derive(Debug)]
 pub struct Serving {
     alive: LivelinessToken,
+    /// What tells ROS 2 of all this.
+    announced: Vec<LivelinessToken>,
     queryables: Queryables,
     outputs: JoinSet<()>,
 }
 
 impl Serving {
-    /// Declares all publishers and queryables under `prefix`, and at last the token of life: who
-    /// sees it may ask.
+    /// Declares all publishers and queryables of `node`, and at last the token of life: who sees
+    /// it may ask.
     ///
     /// # Errors
     /// When Zenoh refuses a key or a declaration.
     pub async fn start(
         session: &Session,
-        prefix: &Prefix,
+        mut node: RosNode,
         settings: Settings,
         sources: Sources,
     ) -> Result<Self, ServingError> {
         let Sources { snapshots, verdicts, commands, status } = sources;
         let responder =
             Arc::new(Responder::new(&settings, snapshots.clone(), status.clone(), commands));
-        let declare = outputs::Declare { session, prefix };
+        let mut declare = outputs::Declare { session, node: &mut node };
         let mut tasks = JoinSet::new();
         declare.maps(&settings, &snapshots, &responder.products(), &mut tasks).await?;
         declare.estimates(&settings, &snapshots, &mut tasks).await?;
         declare.transform(settings, snapshots, &mut tasks).await?;
         declare.diagnostics(status, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
-        let queryables = Queryables::declare(session, prefix, responder).await?;
-        let key = prefix.key(ALIVE)?;
+        let queryables = Queryables::declare(session, &mut node, responder).await?;
+        let announced = node.announce(session).await?;
+        let key = node.prefix().key(ALIVE)?;
         let alive = session.liveliness().declare_token(key.clone()).await;
         let alive = alive.map_err(|source| ServingError::Declare { key, source })?;
-        Ok(Self { alive, queryables, outputs: tasks })
+        Ok(Self { alive, announced, queryables, outputs: tasks })
     }
 
     /// Takes the token back, answers no more queries, and publishes nothing more.
     ///
     /// It takes a moment at most: replies that have not been sent by then are not sent at all.
     pub async fn stop(self) {
-        let Self { alive, queryables, mut outputs } = self;
+        let Self { alive, announced, queryables, mut outputs } = self;
         let stop = async move {
             // It blocks while the network is slow.
-            let undeclare = move || alive.undeclare().wait();
-            if let Ok(Err(error)) = spawn_blocking(undeclare).await {
-                tracing::debug!(%error, "the token of life could not be undeclared");
-            }
+            let undeclare = move || {
+                for token in std::iter::once(alive).chain(announced) {
+                    if let Err(error) = token.undeclare().wait() {
+                        tracing::debug!(%error, "a token could not be undeclared");
+                    }
+                }
+            };
+            spawn_blocking(undeclare).await.ok();
             queryables.stop().await;
             outputs.shutdown().await;
         };

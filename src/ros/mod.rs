@@ -10,6 +10,7 @@ mod encode;
 mod field_path;
 mod fields;
 mod geometry_msgs;
+pub mod graph;
 mod nav_msgs;
 mod sensor_msgs;
 mod std_msgs;

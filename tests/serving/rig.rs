@@ -8,6 +8,7 @@ use std::time::Duration;
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::ledger::{Entry, Ledger};
+use gmapd::daemon::ros_node::{Convention, RosNode};
 use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
 use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
 use gmapd::daemon::status::{FilterStatus, Status};
@@ -170,7 +171,8 @@ impl Rig {
             status: AskStatus::new(status),
         };
         let prefix = Prefix::parse(ROBOT).expect("it is a key");
-        let serving = Serving::start(&daemon, &prefix, settings, sources).await;
+        let node = RosNode::new(daemon.zid().to_string(), prefix, Convention::Bridge);
+        let serving = Serving::start(&daemon, node, settings, sources).await;
         let serving = serving.expect("nothing stands against it");
         let mut alive = liveliness(&client).await;
         assert_eq!(next(&mut alive).await.kind(), SampleKind::Put);
