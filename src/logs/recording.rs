@@ -243,6 +243,8 @@ struct Metadata {
 struct Information {
     storage_identifier: String,
     relative_file_paths: Vec<PathBuf>,
+    #[serde(default)]
+    compression_mode: String,
 }
 
 impl Recording {
@@ -281,8 +283,14 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     };
     let metadata: Metadata =
         serde_saphyr::from_str(&text).map_err(|error| wrong(error.to_string()))?;
-    let Information { storage_identifier, relative_file_paths } =
+    let Information { storage_identifier, relative_file_paths, compression_mode } =
         metadata.rosbag2_bagfile_information;
+    if ["file", "message"].contains(&compression_mode.to_lowercase().as_str()) {
+        return Err(wrong(format!(
+            "its compression mode is `{compression_mode}`, and only chunks of MCAP may be \
+             compressed; `ros2 bag convert` makes one of the other"
+        )));
+    }
     if storage_identifier != "mcap" {
         return Err(wrong(format!(
             "the recording is stored as `{storage_identifier}`, and only mcap is read; `ros2 bag \
