@@ -159,7 +159,7 @@ pub enum Message {
     /// A sweep.
     LaserScan(ros::LaserScan),
     /// Odometry.
-    Odometry(ros::Odometry),
+    Odometry(Box<ros::Odometry>),
     /// Transforms of either kind.
     Transforms(ros::TfMessage),
 }
@@ -188,14 +188,14 @@ impl RawMessage {
         let bytes = &self.bytes;
         match (self.topic.wire, self.topic.kind) {
             (Wire::Ros2, Kind::LaserScan) => ros2(bytes).map(Message::LaserScan),
-            (Wire::Ros2, Kind::Odometry) => ros2(bytes).map(Message::Odometry),
+            (Wire::Ros2, Kind::Odometry) => ros2(bytes).map(Box::new).map(Message::Odometry),
             (Wire::Ros2, Kind::Transforms | Kind::StaticTransforms) => {
                 ros2(bytes).map(Message::Transforms)
             }
             (Wire::Ros1, kind) => {
                 let message = match kind {
                     Kind::LaserScan => ros1::laser_scan(bytes).map(Message::LaserScan),
-                    Kind::Odometry => ros1::odometry(bytes).map(Message::Odometry),
+                    Kind::Odometry => ros1::odometry(bytes).map(Box::new).map(Message::Odometry),
                     Kind::Transforms | Kind::StaticTransforms => {
                         ros1::transforms(bytes).map(Message::Transforms)
                     }
@@ -216,7 +216,7 @@ impl RawMessage {
         }
         Ok(match self.decode()? {
             Message::LaserScan(message) => ros::cdr(&message),
-            Message::Odometry(message) => ros::cdr(&message),
+            Message::Odometry(message) => ros::cdr(&*message),
             Message::Transforms(message) => ros::cdr(&message),
         })
     }
