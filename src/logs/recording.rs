@@ -40,7 +40,7 @@ pub enum Format {
 #[derive(Debug, Error)]
 pub enum RecordingError {
     /// The file or folder does not open.
-    #[error("cannot open {}", path.display())]
+    #[error("cannot open the log {}", path.display())]
     Open {
         /// The recording.
         path: PathBuf,
