@@ -15,6 +15,7 @@
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
 //! - [`daemon`]: live mapping on a Zenoh mesh;
+//! - [`recorded`]: recorded messages in the order in which the daemon takes them;
 //! - [`files`], [`clock`], [`statistics`]: whole files, clocks, percentiles.
 
 pub mod clock;

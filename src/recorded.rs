@@ -234,7 +234,7 @@ impl Readings {
         let Ok(content) = message.decode() else { return };
         match content {
             Message::LaserScan(scan) => self.take_scan(scan, now),
-            Message::Odometry(odometry) => self.take_odometry(odometry),
+            Message::Odometry(odometry) => self.take_odometry(*odometry),
             Message::Transforms(transforms) => {
                 let fixed = message.topic.kind == Kind::StaticTransforms;
                 let kind = if fixed { tf::Kind::Static } else { tf::Kind::Dynamic };

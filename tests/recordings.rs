@@ -51,6 +51,13 @@ fn simulated_log(directory: &TempDir) -> PathBuf {
     path
 }
 
+/// How odometry is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Told {
+    Messages,
+    Transforms,
+}
+
 /// Writes messages as a robot sends them.
 struct Robot {
     file: McapRecorder,
@@ -76,8 +83,8 @@ impl Robot {
             .expect("the file takes messages");
     }
 
-    /// The log's messages from one scan to another; odometry as messages or as transforms.
-    fn drive(&mut self, log: &Path, scans: std::ops::Range<usize>, as_transforms: bool) {
+    /// The log's messages from one scan to another; odometry as it is to be told.
+    fn drive(&mut self, log: &Path, scans: std::ops::Range<usize>, odometry_as: Told) {
         let log = CarmenLog::open(log).expect("it was simulated");
         let mut number = 0;
         for reading in log.readings().expect("it was opened before") {
@@ -92,7 +99,7 @@ impl Robot {
                 self.send("tf_static", stamp, &mount);
             }
             let Messages { odometry, scan } = self.frames.messages(&reading);
-            if as_transforms {
+            if odometry_as == Told::Transforms {
                 self.send("tf", stamp, &transform_of(odometry));
             } else {
                 self.send("odom", stamp, &odometry);
@@ -118,7 +125,7 @@ fn transform_of(odometry: ros::Odometry) -> ros::TfMessage {
 /// A whole recording of a log.
 fn recorded(directory: &TempDir, log: &Path) -> PathBuf {
     let mut robot = Robot::create(&directory.path().join("run.mcap"), "");
-    robot.drive(log, 0..usize::MAX, false);
+    robot.drive(log, 0..usize::MAX, Told::Messages);
     robot.finish()
 }
 
@@ -163,7 +170,7 @@ fn odometry_from_transforms_gives_the_same_map() {
     let (expected, _) = replay(&[text(&log)]);
     let mut robot = Robot::create(&directory.path().join("tf.mcap"), "");
     robot.frames = Frames { odom: "world", base: "foot", laser: "eye" };
-    robot.drive(&log, 0..usize::MAX, true);
+    robot.drive(&log, 0..usize::MAX, Told::Transforms);
     let path = robot.finish();
     let (found, _) = replay(&[text(&path)]);
     assert_eq!(found["sha256"]["map.pgm"], expected["sha256"]["map.pgm"]);
@@ -182,7 +189,7 @@ fn a_folder_of_files_is_one_recording() {
     // Their names are not in the order of their content.
     for (name, scans) in [("b.mcap", 0..500), ("a.mcap", 500..usize::MAX)] {
         let mut robot = Robot::create(&folder.join(name), "");
-        robot.drive(&log, scans, false);
+        robot.drive(&log, scans, Told::Messages);
         robot.finish();
     }
     let metadata = "rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n  \
@@ -242,14 +249,35 @@ fn a_damaged_chunk_costs_no_more_than_itself() {
 }
 
 #[test]
+fn no_wrong_byte_ends_the_program() {
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let mut robot = Robot::create(&directory.path().join("short.mcap"), "");
+    robot.drive(&log, 0..60, Told::Messages);
+    let path = robot.finish();
+    let whole = fs::read(&path).expect("it was written");
+    let mut readable = 0;
+    for place in (8..whole.len()).step_by(whole.len() / 300) {
+        let mut bytes = whole.clone();
+        bytes[place] ^= 0xff;
+        fs::write(&path, &bytes).expect("it is writable");
+        if let Ok(recorded) = open(&path, &Wanted::default()) {
+            assert!(usable_scans(&recorded) <= 60);
+            readable += 1;
+        }
+    }
+    assert!(readable > 30, "{readable}");
+}
+
+#[test]
 fn topics_are_found_or_asked_for() {
     let directory = directory();
     let log = simulated_log(&directory);
     let path = directory.path().join("two.mcap");
     let mut robot = Robot::create(&path, "/robot01");
-    robot.drive(&log, 0..300, false);
+    robot.drive(&log, 0..300, Told::Messages);
     robot.namespace = "/robot02";
-    robot.drive(&log, 0..200, false);
+    robot.drive(&log, 0..200, Told::Messages);
     robot.finish();
     let several = gmapd(&["replay", text(&path)]);
     assert_eq!(several.status.code(), Some(1));
@@ -300,7 +328,7 @@ fn a_recording_that_was_not_finished_can_be_replayed() {
     let directory = directory();
     let log = simulated_log(&directory);
     let mut robot = Robot::create(&directory.path().join("run.mcap"), "");
-    robot.drive(&log, 0..1000, false);
+    robot.drive(&log, 0..1000, Told::Messages);
     let unfinished = robot.file.unfinished().to_owned();
     let crashed = directory.path().join("crashed");
     fs::copy(&unfinished, &crashed).expect("it is there");

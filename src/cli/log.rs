@@ -6,12 +6,13 @@ use std::path::Path;
 use anyhow::ensure;
 use clap::Args;
 use gmapd::config::Config;
+use gmapd::daemon::frames::FrameNames;
 use gmapd::daemon::ledger::Verdict;
 use gmapd::daemon::synchronizer::Refusal;
 use gmapd::logs::LogStatistics;
 use gmapd::logs::carmen::CarmenLog;
 use gmapd::logs::recording::{self, Format, Recording};
-use gmapd::recorded::{Recorded, Wanted};
+use gmapd::recorded::{Recorded, Topics, Wanted};
 
 /// Malformed lines and damaged places that are told one by one.
 const FAULTS_SHOWN: usize = 10;
@@ -62,11 +63,12 @@ impl Log {
         }
     }
 
-    /// Tells what could not be read.
+    /// Tells what is used, and what could not be read.
     pub(super) fn warn(&self, path: &Path) {
         match self {
             Self::Carmen(log) => warn_about_lines(log.statistics(), path),
             Self::Recorded(recorded) => {
+                eprintln!("{}", used(recorded));
                 for fault in recorded.faults().iter().take(FAULTS_SHOWN) {
                     eprintln!("warning: {fault}; what can be read is used");
                 }
@@ -76,6 +78,14 @@ impl Log {
             }
         }
     }
+}
+
+/// What is used of a recording, in words.
+fn used(recorded: &Recorded) -> String {
+    let Topics { scan, odometry, transforms, .. } = recorded.topics();
+    let FrameNames { base, odom } = recorded.frames();
+    let odometry = odometry.clone().unwrap_or_else(|| transforms.join(" and "));
+    format!("scans on {scan}, odometry on {odometry}, from `{odom}` to `{base}`")
 }
 
 fn warn_about_lines(log: &LogStatistics, path: &Path) {

@@ -190,7 +190,7 @@ async fn send_recorded(feed: &mut Feed, recorded: &Recorded, rate: Rate) -> anyh
             Rate::Times(times) => {
                 let first = *first.get_or_insert(message.log_time);
                 let passed = message.log_time.seconds_since(first).max(0.0);
-                let due = Duration::from_secs_f64(passed / times);
+                let due = Duration::try_from_secs_f64(passed / times).unwrap_or(Duration::MAX);
                 sleep(due.saturating_sub(watch.elapsed().wall)).await;
             }
         }

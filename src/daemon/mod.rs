@@ -170,7 +170,7 @@ async fn finish(recorder: Recorder) {
         }
         Ok(Err(error)) => tracing::error!("the recording is not whole: {error}"),
         Err(_) => {
-            tracing::warn!("the recording is not finished in time; it can be read all the same")
+            tracing::warn!("the recording is not finished in time; it can be read all the same");
         }
     }
 }

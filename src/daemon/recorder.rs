@@ -87,7 +87,7 @@ pub struct Recorder {
 
 #[derive(Debug)]
 enum Item {
-    Sample(Taken),
+    Sample(Box<Taken>),
     End,
 }
 
@@ -215,7 +215,7 @@ impl Taps<'_> {
             }
             let log_time = Stamp(clock::unix_nanoseconds());
             let taken = Taken { topic: Arc::clone(&topic), message_type, log_time, sample };
-            if sender.try_send(Item::Sample(taken)).is_err() {
+            if sender.try_send(Item::Sample(Box::new(taken))).is_err() {
                 lost.fetch_add(1, Ordering::Relaxed);
             }
         }
@@ -251,7 +251,7 @@ fn write(
     lost: &AtomicU64,
 ) -> Result<Recorded, RecordError> {
     while let Ok(Item::Sample(taken)) = items.recv() {
-        let Taken { topic, message_type, log_time, sample } = &taken;
+        let Taken { topic, message_type, log_time, sample } = &*taken;
         let encoding = sample.encoding().to_string();
         let Some(bytes) = cdr(&sample.payload().to_bytes(), message_type, &encoding) else {
             lost.fetch_add(1, Ordering::Relaxed);

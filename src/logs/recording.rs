@@ -40,7 +40,7 @@ pub enum Format {
 #[derive(Debug, Error)]
 pub enum RecordingError {
     /// The file or folder does not open.
-    #[error("cannot open {}", path.display())]
+    #[error("cannot open the log {}", path.display())]
     Open {
         /// The recording.
         path: PathBuf,
@@ -159,7 +159,7 @@ pub enum Message {
     /// A sweep.
     LaserScan(ros::LaserScan),
     /// Odometry.
-    Odometry(ros::Odometry),
+    Odometry(Box<ros::Odometry>),
     /// Transforms of either kind.
     Transforms(ros::TfMessage),
 }
@@ -188,14 +188,14 @@ impl RawMessage {
         let bytes = &self.bytes;
         match (self.topic.wire, self.topic.kind) {
             (Wire::Ros2, Kind::LaserScan) => ros2(bytes).map(Message::LaserScan),
-            (Wire::Ros2, Kind::Odometry) => ros2(bytes).map(Message::Odometry),
+            (Wire::Ros2, Kind::Odometry) => ros2(bytes).map(Box::new).map(Message::Odometry),
             (Wire::Ros2, Kind::Transforms | Kind::StaticTransforms) => {
                 ros2(bytes).map(Message::Transforms)
             }
             (Wire::Ros1, kind) => {
                 let message = match kind {
                     Kind::LaserScan => ros1::laser_scan(bytes).map(Message::LaserScan),
-                    Kind::Odometry => ros1::odometry(bytes).map(Message::Odometry),
+                    Kind::Odometry => ros1::odometry(bytes).map(Box::new).map(Message::Odometry),
                     Kind::Transforms | Kind::StaticTransforms => {
                         ros1::transforms(bytes).map(Message::Transforms)
                     }
@@ -216,7 +216,7 @@ impl RawMessage {
         }
         Ok(match self.decode()? {
             Message::LaserScan(message) => ros::cdr(&message),
-            Message::Odometry(message) => ros::cdr(&message),
+            Message::Odometry(message) => ros::cdr(&*message),
             Message::Transforms(message) => ros::cdr(&message),
         })
     }
@@ -243,6 +243,8 @@ struct Metadata {
 struct Information {
     storage_identifier: String,
     relative_file_paths: Vec<PathBuf>,
+    #[serde(default)]
+    compression_mode: String,
 }
 
 impl Recording {
@@ -281,8 +283,14 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     };
     let metadata: Metadata =
         serde_saphyr::from_str(&text).map_err(|error| wrong(error.to_string()))?;
-    let Information { storage_identifier, relative_file_paths } =
+    let Information { storage_identifier, relative_file_paths, compression_mode } =
         metadata.rosbag2_bagfile_information;
+    if ["file", "message"].contains(&compression_mode.to_lowercase().as_str()) {
+        return Err(wrong(format!(
+            "its compression mode is `{compression_mode}`, and only chunks of MCAP may be \
+             compressed; `ros2 bag convert` makes one of the other"
+        )));
+    }
     if storage_identifier != "mcap" {
         return Err(wrong(format!(
             "the recording is stored as `{storage_identifier}`, and only mcap is read; `ros2 bag \

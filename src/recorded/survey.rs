@@ -49,7 +49,7 @@ impl TopicSurvey {
             Message::LaserScan(scan) => self.note(&scan.header, &scan.header.frame_id),
             Message::Odometry(odometry) => {
                 self.note(&odometry.header, &odometry.child_frame_id)?;
-                convert::odometry(odometry).map(|_| ()).map_err(|error| error.to_string())
+                convert::odometry(*odometry).map(|_| ()).map_err(|error| error.to_string())
             }
             Message::Transforms(transforms) => {
                 let transforms = transforms.transforms.into_iter().map(convert::transform);
