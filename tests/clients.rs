@@ -253,7 +253,8 @@ fn a_recording_of_a_live_run_replays_to_its_map() {
 fn recorded_logs_give_the_same_too() {
     let beside = concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data");
     let data = std::env::var_os("GMAPD_LOGS").map_or_else(|| beside.into(), PathBuf::from);
-    for name in ["aces/aces.log", "tinyslam/exp1.log"] {
+    let bag = "ros-gmapping-tutorial/basic_localization_stage.bag";
+    for name in ["aces/aces.log", "tinyslam/exp1.log", bag] {
         let log = data.join(name);
         if !log.exists() {
             eprintln!("NOT RUN: no recorded log {}", log.display());

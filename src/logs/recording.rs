@@ -248,7 +248,7 @@ struct Information {
 }
 
 impl Recording {
-    /// The files of a recording that [`format`] has told.
+    /// The files of a recording that [`format()`] has told.
     ///
     /// # Errors
     /// When a folder has no files of a known format.
