@@ -128,8 +128,8 @@ NESTED = {
 }
 
 
-def to_cdr(kind, message, little_endian=True):
-    """The message as an independent implementation writes it."""
+def to_object(kind, message):
+    """The message as an object of an independent implementation."""
 
     def nested(name, value):
         if name in ("pose", "twist"):
@@ -147,7 +147,18 @@ def to_cdr(kind, message, little_endian=True):
             values[name] = value
         return ROS.types[kind](**values)
 
-    return bytes(ROS.serialize_cdr(build(kind, message), kind, little_endian=little_endian))
+    return build(kind, message)
+
+
+def to_cdr(kind, message, little_endian=True):
+    """The message as an independent implementation writes it."""
+    message = to_object(kind, message)
+    return bytes(ROS.serialize_cdr(message, kind, little_endian=little_endian))
+
+
+def definition(kind):
+    """The message's definition, with those of all messages in it."""
+    return ROS.generate_msgdef(kind, ros_version=2)[0]
 
 
 def from_cdr(kind, payload):
@@ -157,3 +168,20 @@ def from_cdr(kind, payload):
 def png_size(data):
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     return struct.unpack(">II", data[16:24])
+
+
+def cells(grid):
+    return np.array(grid.data).reshape(grid.info.height, grid.info.width)
+
+
+def assert_room(grid):
+    """The walls are where they are: the map begins where odometry was, so the frames agree."""
+    data, info = cells(grid), grid.info
+
+    def value(x, y):
+        column = math.floor((x - info.origin.position.x) / info.resolution)
+        row = math.floor((y - info.origin.position.y) / info.resolution)
+        return data[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].max()
+
+    assert all(value(x, y) == 100 for x, y in [(-4, 0), (0, -3), (5, -1), (0, 3.2), (1, -0.2)])
+    assert all(value(x, y) == 0 for x, y in [(-2, 0), (0, -2), (3, -1), (0, 2)])
