@@ -254,7 +254,7 @@ impl GMapping {
         on_phase(Phase::Match);
         let report = self.resample(scan.hits.len());
         on_phase(Phase::Resample);
-        self.register(scan, on_phase);
+        self.register(&scan, on_phase);
         if report.resampled || self.particles.len() == 1 {
             self.settle();
         }
@@ -343,12 +343,12 @@ impl GMapping {
 
     /// Enters the scan in each particle's map, and in the output map at the same time if there are
     /// threads.
-    fn register(&mut self, mut scan: PreparedScan, on_phase: &mut dyn FnMut(Phase)) {
+    fn register(&mut self, scan: &PreparedScan, on_phase: &mut dyn FnMut(Phase)) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
-        let outline = std::mem::take(&mut scan.outline);
+        let outline = scan.outline.clone();
         let Self { matcher, particles, output, tree, pool, .. } = self;
         let mut register = || {
-            for_each(pool.as_ref(), particles, |_, particle| matcher.register(particle, &scan));
+            for_each(pool.as_ref(), particles, |_, particle| matcher.register(particle, scan));
         };
         let extend = || output.extend(tree, best, outline);
         if let Some(pool) = &*pool {
