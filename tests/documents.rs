@@ -8,16 +8,19 @@ use gmapd::config::RawConfig;
 use serde_json::Value;
 
 /// Documents whose file names must be there.
-const DOCUMENTS: [&str; 5] = [
+const DOCUMENTS: [&str; 8] = [
     "README.md",
     "CHANGELOG.md",
     "docs/architecture.md",
     "docs/dependencies.md",
+    "docs/mesh.md",
     "docs/parameters.md",
+    "docs/ros2.md",
+    "bridge/README.md",
 ];
 
 /// Folders whose files the documents name.
-const FOLDERS: [&str; 6] = ["src/", "tests/", "docs/", "config/", "benches/", ".ci/"];
+const FOLDERS: [&str; 7] = ["src/", "tests/", "docs/", "config/", "benches/", "bridge/", ".ci/"];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

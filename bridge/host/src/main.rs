@@ -36,14 +36,17 @@ struct Arguments {
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     zenoh::init_log_from_env_or("warn,zenoh_plugin_ros2dds=info");
-    let runtime = start(&Arguments::parse()).await?;
+    let arguments = Arguments::parse();
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
+    let runtime = start(&arguments).await?;
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
     }
-    runtime.close().await.map_err(|error| anyhow!("cannot end: {error}"))
+    runtime.close().await.map_err(|error| anyhow!("cannot end: {error}"))?;
+    // The plugin's tasks panic when they are let go after their session.
+    std::process::exit(0);
 }
 
 async fn start(arguments: &Arguments) -> anyhow::Result<Runtime> {
