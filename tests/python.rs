@@ -29,7 +29,10 @@ fn python(tests: &Path) -> PathBuf {
 #[test]
 fn python_clients_feed_ask_and_command_the_daemon() {
     let tests = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python");
-    run(Command::new(python(&tests))
+    // A client that hangs fails here; they take two minutes.
+    run(Command::new("timeout")
+        .arg("900")
+        .arg(python(&tests))
         .args([
             "-m",
             "pytest",

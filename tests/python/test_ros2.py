@@ -2,6 +2,7 @@
 
 import struct
 
+import pytest
 import robot as rb
 import zenoh.ext
 import zenoh_ros2_sdk as ros2
@@ -36,6 +37,10 @@ class Node:
     def __init__(self, endpoint):
         address, port = endpoint.removeprefix("tcp/").split(":")
         self.mesh = {"domain_id": DOMAIN, "router_ip": address, "router_port": int(port)}
+
+    def close(self):
+        # The SDK never closes its session, and the interpreter waits for the session's threads.
+        ros2.ZenohSession.get_instance().session.close()
 
     def typed(self, kind):
         return {**self.mesh, "msg_definition": rb.definition(kind), "type_hash": type_hash(kind)}
@@ -101,11 +106,21 @@ def drive(node, client):
         client.wait_for_verdicts(number)
 
 
-def test_a_node_feeds_the_daemon_and_is_served_by_it(start):
-    endpoint = free_endpoint()
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def node(endpoint):
+    node = Node(endpoint)
+    yield node
+    node.close()
+
+
+def test_a_node_feeds_the_daemon_and_is_served_by_it(start, endpoint, node):
     settings = ["interop=rmw_zenoh", f"ros_domain_id={DOMAIN}", "map_update_interval=0"]
     _, client = start(prefix="", settings=settings, endpoint=endpoint)
-    node = Node(endpoint)
 
     empty = node.get_map()
     assert (empty.info.width, empty.info.height) == (0, 0)
