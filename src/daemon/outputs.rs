@@ -180,7 +180,7 @@ impl Declare<'_> {
             // A map goes out in pieces. Those that may be dropped are, and then none of it arrives;
             // this one waits for its place, and only the next is dropped meanwhile.
             .congestion_control(CongestionControl::BlockFirst)
-            .priority(Priority::DataLow)
+            .priority(kind.priority())
             .cache(CacheConfig::default().max_samples(1))
             .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
             .publisher_detection()
@@ -233,6 +233,16 @@ impl Retained {
             Self::Map => OCCUPANCY_GRID,
             Self::Metadata => MAP_META_DATA,
             Self::Path => PATH,
+        }
+    }
+
+    /// One message of a priority can wait for its place, so each kind has its own: with a new
+    /// version all go out at once, and the smaller ones would be dropped behind the map.
+    const fn priority(self) -> Priority {
+        match self {
+            Self::Map => Priority::DataLow,
+            Self::Path => Priority::Data,
+            Self::Metadata => Priority::DataHigh,
         }
     }
 
