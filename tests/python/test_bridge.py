@@ -19,6 +19,7 @@ os.environ.update(CYCLONEDDS_URI=LOOPBACK, ROS_DISTRO="jazzy")
 import dds  # noqa: E402
 import robot as rb  # noqa: E402
 from conftest import Client, Daemon, free_endpoint, open_session, until  # noqa: E402
+from cyclonedds.idl._support import Endianness  # noqa: E402
 
 CONFIGURATIONS = pathlib.Path(__file__).parents[2] / "bridge"
 MAP, PATH = "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path"
@@ -41,6 +42,23 @@ OUTPUTS = {
 def dds_name(kind):
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
+
+
+# A line is a message's type, byte order and bytes as `rosbags` writes them.
+GOLDEN = [
+    pytest.param(kind, order, bytes.fromhex(digits), id=f"{kind}-{order}")
+    for kind, order, digits in map(
+        str.split, (CONFIGURATIONS.parent / "src/ros/golden/messages.txt").read_text().splitlines()
+    )
+    if "/msg/" in kind
+]
+
+
+@pytest.mark.parametrize(("kind", "order", "golden"), GOLDEN)
+def test_cyclonedds_reads_and_writes_the_golden_bytes(kind, order, golden):
+    message = dds.message(kind).deserialize(golden)
+    endianness = Endianness[order.capitalize()]
+    assert message.serialize(endianness=endianness, use_version_2=False) == golden
 
 
 class Rig:
