@@ -43,7 +43,7 @@ struct Status {
     inputs: BTreeMap<String, InputStatus>,
 }
 
-#[derive(Deserialize)]
+#[derive(Default, Deserialize)]
 struct InputStatus {
     key: String,
 }
@@ -77,21 +77,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 /// The keys that the robot's daemon tells, or without a daemon those of its defaults.
 async fn input_keys(session: &Session, robot: &Prefix) -> anyhow::Result<InputKeys> {
     let status = robot.key("slam/status")?.to_string();
-    let mut names = Keys::default();
     let Some(answer) = mesh::ask(session, &status).await? else {
-        return Ok(InputKeys::under(robot, &names)?);
+        return Ok(InputKeys::under(robot, &Keys::default())?);
     };
-    let status: Status = serde_json::from_slice(&answer.bytes)
+    let mut status: Status = serde_json::from_slice(&answer.bytes)
         .with_context(|| format!("what answers on {status} is no gmapd"))?;
-    let told = |input: Input, name: &mut String| {
-        if let Some(input) = status.inputs.get(input.name()) {
-            name.clone_from(&input.key);
-        }
-    };
-    told(Input::Scan, &mut names.scan);
-    told(Input::Odom, &mut names.odom);
-    told(Input::Tf, &mut names.tf);
-    told(Input::TfStatic, &mut names.tf_static);
-    // These are whole keys already.
-    Ok(InputKeys::under(&Prefix::parse("")?, &names)?)
+    // An input that an older daemon does not have leaves an empty key, which is an error.
+    let key = |input: Input| status.inputs.remove(input.name()).unwrap_or_default().key;
+    Ok(InputKeys::parse(Input::ALL.map(key))?)
 }

@@ -84,6 +84,15 @@ impl InputKeys {
         Ok(Self::new([scan?, odom?, tf?, tf_static?]))
     }
 
+    /// Whole keys, as a daemon tells them; by ROS 2's own convention they end with a wildcard.
+    ///
+    /// # Errors
+    /// When one of them is no key.
+    pub fn parse(keys: [String; Input::ALL.len()]) -> Result<Self, KeyError> {
+        let [scan, odom, tf, tf_static] = keys.map(key_expression);
+        Ok(Self::new([scan?, odom?, tf?, tf_static?]))
+    }
+
     /// The key of an input.
     #[must_use]
     pub const fn of(&self, input: Input) -> &OwnedKeyExpr {

@@ -13,9 +13,14 @@ use zenoh::sample::{Sample, SampleKind};
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
 use super::input::Input;
-use super::keys::{InputKeys, KeyError, Prefix, plain_message};
+use super::keys::{InputKeys, KeyError, Prefix, key_expression, plain_message};
 use crate::clock;
 use crate::logs::mcap_writer::{McapRecorder, RecordError, Recordable};
+use crate::ros::graph::rmw_zenoh::{Graph, TypeHashes};
+use crate::ros::graph::{
+    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, PATH, POSE_ARRAY,
+    POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, WireType,
+};
 use crate::ros::{self, Message as _};
 use crate::slam::pose::Stamp;
 
@@ -26,14 +31,14 @@ const MOST_WAITING: usize = 4096;
 const STATIC_TRANSFORMS: usize = 100;
 
 /// What the daemon publishes, beside `tf`.
-const OUTPUTS: [(&str, &str); 7] = [
-    ("map", ros::OccupancyGrid::TYPE),
-    ("map_metadata", ros::MapMetaData::TYPE),
-    ("pose", ros::PoseWithCovarianceStamped::TYPE),
-    ("particlecloud", ros::PoseArray::TYPE),
-    ("path", ros::Path::TYPE),
-    ("entropy", ros::Float64::TYPE),
-    ("diagnostics", ros::DiagnosticArray::TYPE),
+const OUTPUTS: [(&str, WireType); 7] = [
+    ("map", OCCUPANCY_GRID),
+    ("map_metadata", MAP_META_DATA),
+    ("pose", POSE_WITH_COVARIANCE_STAMPED),
+    ("particlecloud", POSE_ARRAY),
+    ("path", PATH),
+    ("entropy", FLOAT64),
+    ("diagnostics", DIAGNOSTIC_ARRAY),
 ];
 
 /// Why nothing is recorded, or not to the end.
@@ -117,22 +122,27 @@ impl Recorder {
         let ended = spawn(file, items, Arc::clone(&lost))?;
         let taps = Taps { session, sender: &sender, lost: &lost };
         let mut inputs = Vec::new();
-        for (input, message_type) in [
-            (Input::Tf, ros::TfMessage::TYPE),
-            (Input::Odom, ros::Odometry::TYPE),
-            (Input::Scan, ros::LaserScan::TYPE),
-        ] {
-            inputs.push(taps.plain(keys.of(input), message_type).await?);
+        for input in [Input::Tf, Input::Odom, Input::Scan] {
+            inputs.push(taps.plain(keys.of(input), input.wire_type().name).await?);
         }
         let tf_static = Some(taps.with_history(keys.of(Input::TfStatic)).await?);
         let mut outputs = Vec::new();
-        for (name, message_type) in OUTPUTS {
-            outputs.push(taps.plain(&prefix.key(name)?, message_type).await?);
+        // Who reads scans by ROS 2's own convention publishes by it.
+        let domain = Graph::name_in(keys.of(Input::Scan)).map(|(domain, _)| domain);
+        let output_key = |name: &str, wire_type: WireType| match domain {
+            Some(domain) => {
+                let graph = Graph { domain, hashes: TypeHashes::Known };
+                key_expression(graph.subscription_key(&prefix.key(name)?, wire_type))
+            }
+            None => prefix.key(name),
+        };
+        for (name, wire_type) in OUTPUTS {
+            outputs.push(taps.plain(&output_key(name, wire_type)?, wire_type.name).await?);
         }
         // What the daemon adds to the transforms, where it listens to others.
-        let own_tf = prefix.key("tf")?;
+        let own_tf = output_key("tf", TF_MESSAGE)?;
         if own_tf != *keys.of(Input::Tf) {
-            outputs.push(taps.plain(&own_tf, ros::TfMessage::TYPE).await?);
+            outputs.push(taps.plain(&own_tf, TF_MESSAGE.name).await?);
         }
         Ok(Self { unfinished, inputs, tf_static, outputs, sender, ended })
     }
@@ -208,7 +218,8 @@ impl Taps<'_> {
         message_type: &'static str,
     ) -> impl Fn(Sample) + Send + Sync + 'static {
         let (sender, lost) = (self.sender.clone(), Arc::clone(self.lost));
-        let topic: Arc<str> = format!("/{key}").into();
+        let name = Graph::name_in(key).map_or(key.as_str(), |(_, name)| name);
+        let topic: Arc<str> = format!("/{name}").into();
         move |sample: Sample| {
             if sample.kind() == SampleKind::Delete {
                 return;

@@ -1,12 +1,16 @@
 """A ROS 2 node on rmw_zenoh, by an independent implementation of its conventions."""
 
+import json
+import signal
 import struct
+import subprocess
 
 import pytest
 import robot as rb
 import zenoh.ext
 import zenoh_ros2_sdk as ros2
-from conftest import free_endpoint, until
+from conftest import GMAPD, free_endpoint, until
+from mcap.reader import make_reader
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
 
 DOMAIN = 7
@@ -72,12 +76,10 @@ class Node:
 
 def rmw_subscription(session, name, kind):
     """The samples that a transient-local subscription of rmw_zenoh hears."""
-    package, _, name_of_type = kind.split("/")
-    key = f"{DOMAIN}/{name}/{package}::msg::dds_::{name_of_type}_/{type_hash(kind)}"
     samples = []
     zenoh.ext.declare_advanced_subscriber(
         session,
-        key,
+        rmw_key(name, kind),
         samples.append,
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
         recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
@@ -93,6 +95,11 @@ def type_hash(kind):
 def publish(publisher, kind, message):
     fields = vars(rb.to_object(kind, message))
     publisher.publish(**{name: fields[name] for name in message})
+
+
+def rmw_key(name, kind):
+    package, _, name_of_type = kind.split("/")
+    return f"{DOMAIN}/{name}/{package}::msg::dds_::{name_of_type}_/{type_hash(kind)}"
 
 
 def drive(node, client):
@@ -162,3 +169,27 @@ def test_a_node_feeds_the_daemon_and_is_served_by_it(start, endpoint, node):
     # What a ROS 2 node sees is what everybody is told.
     direct = rb.from_cdr(MAP, client.ask("map").payload.to_bytes())
     assert list(answered.data) == list(direct.data)
+
+
+def test_recordings_have_the_names_that_ros_knows(start, tmp_path, endpoint):
+    inside, beside = tmp_path / "inside.mcap", tmp_path / "beside.mcap"
+    settings = ["interop=rmw_zenoh", f"ros_domain_id={DOMAIN}", f"record={inside}"]
+    daemon, client = start(prefix="", settings=settings, endpoint=endpoint)
+    command = [GMAPD, "record", "-e", endpoint, "-o", str(beside)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as recorder:
+        assert "recording" in recorder.stderr.readline()
+        for number, (seconds, pose) in enumerate(rb.route(), start=1):
+            client.put(rmw_key("odom", rb.ODOMETRY), rb.to_cdr(rb.ODOMETRY, rb.odometry(seconds, pose)))
+            client.put(rmw_key("scan", rb.SCAN), rb.to_cdr(rb.SCAN, rb.scan(seconds, pose)))
+            client.wait_for_verdicts(number)
+        status = client.status()
+        assert daemon.stop() == 0
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(30) == 0
+
+    for path in (inside, beside):
+        with path.open("rb") as file:
+            channels = make_reader(file).get_summary().channels.values()
+        assert {"/scan", "/odom", "/pose", "/tf"} <= {channel.topic for channel in channels}
+        done = subprocess.run([GMAPD, "replay", path, "--json"], capture_output=True, check=True)
+        assert json.loads(done.stdout)["readings"]["processed"] == status["scans"]["processed"]

@@ -55,6 +55,16 @@ impl Graph {
         format!("{}/{name}/{}/*", self.domain, dds_type(wire_type))
     }
 
+    /// The name of the topic or service that a key of the graph belongs to, and the graph's domain.
+    #[must_use]
+    pub fn name_in(key: &str) -> Option<(u32, &str)> {
+        let (domain, rest) = key.split_once('/')?;
+        let (rest, _hash) = rest.rsplit_once('/')?;
+        let (name, dds_type) = rest.rsplit_once('/')?;
+        let domain = domain.parse().ok()?;
+        dds_type.contains("::dds_::").then_some((domain, name))
+    }
+
     /// The key of the token that tells of a node.
     #[must_use]
     pub fn node_token(self, node: &Node) -> String {
@@ -174,6 +184,9 @@ mod tests {
         assert_eq!(HUMBLE.key("dynamic_map", GET_MAP), service);
         let scan = "0/robot1/scan/sensor_msgs::msg::dds_::LaserScan_/*";
         assert_eq!(JAZZY.subscription_key("robot1/scan", LASER_SCAN), scan);
+        assert_eq!(Graph::name_in(scan), Some((0, "robot1/scan")));
+        assert_eq!(Graph::name_in(service), Some((7, "dynamic_map")));
+        assert_eq!(Graph::name_in("7/robot01/front/scan"), None);
     }
 
     #[test]
