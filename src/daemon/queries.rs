@@ -1,6 +1,7 @@
 //! The queryables: every query gets an answer or one sentence that says why not.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc};
@@ -20,6 +21,13 @@ use crate::ros::graph::rmw_zenoh::Attachment;
 
 /// Queries that are answered at once. A reply to a slow client holds its place until it is sent.
 const ANSWERS_AT_ONCE: usize = 64;
+
+/// Maps that go out at once: one after the other, half of those who ask together have theirs in
+/// half of the time, and nobody waits longer.
+const TURNS: usize = 2;
+
+/// A client that does not read in this time gives its turn on, while its reply goes on.
+const LONGEST_TURN: Duration = Duration::from_millis(50);
 
 /// Commands that are done at once; they have their own places, for they wait for the filter.
 const COMMANDS_AT_ONCE: usize = 8;
@@ -55,6 +63,7 @@ pub(super) struct Queryables {
 struct Counter {
     responder: Arc<Responder>,
     answers: Arc<Semaphore>,
+    turns: Arc<Semaphore>,
     commands: Arc<Semaphore>,
     refused: mpsc::Sender<Query>,
     runtime: Handle,
@@ -71,6 +80,7 @@ impl Queryables {
         let counter = Counter {
             responder,
             answers: Arc::new(Semaphore::new(ANSWERS_AT_ONCE)),
+            turns: Arc::new(Semaphore::new(TURNS)),
             commands: Arc::new(Semaphore::new(COMMANDS_AT_ONCE)),
             refused,
             runtime: Handle::current(),
@@ -137,15 +147,27 @@ impl Counter {
             return;
         };
         let responder = self.responder.clone();
-        self.runtime.spawn_blocking(move || {
+        let answering = move || {
             let answer = answer(&responder, topic, &query);
             let answer = answer.map(|answer| asker.sign(answer, &query));
             reply(&query, &key, answer);
             // Whoever asked is told that nothing more comes before the place is free again.
             drop(query);
             drop(place);
-        });
+        };
+        if topic.is_large() {
+            self.runtime.spawn(in_turn(self.turns.clone(), answering));
+        } else {
+            self.runtime.spawn_blocking(answering);
+        }
     }
+}
+
+/// First come, first served.
+async fn in_turn(turns: Arc<Semaphore>, answering: impl FnOnce() + Send + 'static) {
+    let turn = turns.acquire_owned().await;
+    tokio::time::timeout(LONGEST_TURN, spawn_blocking(answering)).await.ok();
+    drop(turn);
 }
 
 impl Asker {

@@ -100,6 +100,12 @@ impl Topic {
         matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::InitialPose | Self::Save)
     }
 
+    /// Whether the answer may be megabytes, which take their time on the network.
+    #[must_use]
+    pub const fn is_large(self) -> bool {
+        matches!(self, Self::Map | Self::DynamicMap | Self::Path)
+    }
+
     /// What is asked with these parameters.
     ///
     /// # Errors
