@@ -113,11 +113,12 @@ impl Responder {
         let snapshot = self.snapshots.borrow().clone();
         match question {
             Question::Map(format) => self.map(&snapshot, *format),
-            Question::DynamicMap => Ok(Answer {
-                payload: self.products_of(&snapshot).cdr(),
-                encoding: cdr_of::<ros::GetMapResponse>(),
-                attachment: None,
-            }),
+            Question::DynamicMap => {
+                self.products.note_asked();
+                let payload = self.products_of(&snapshot).cdr();
+                let encoding = cdr_of::<ros::GetMapResponse>();
+                Ok(Answer { payload, encoding, attachment: None })
+            }
             Question::MapMetadata(format) => {
                 let products = self.products_of(&snapshot);
                 let attachment = Some(products.attachment());
@@ -150,6 +151,7 @@ impl Responder {
     }
 
     fn map(&self, snapshot: &Snapshot, format: MapFormat) -> Result<Answer, Refusal> {
+        self.products.note_asked();
         let products = self.products_of(snapshot);
         Ok(Answer {
             payload: products.map(format, snapshot.estimate.pose_in_map)?,

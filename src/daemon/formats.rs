@@ -1,6 +1,7 @@
 //! One version of the map in every format, each made once, when somebody asks for it.
 
 use std::num::NonZeroUsize;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use bytes::Bytes;
@@ -244,6 +245,7 @@ impl MapProducts {
 pub struct ProductCache {
     empty: EmptyMap,
     newest: Mutex<Arc<MapProducts>>,
+    asked: AtomicBool,
 }
 
 impl ProductCache {
@@ -251,7 +253,20 @@ impl ProductCache {
     #[must_use]
     pub fn new(empty: EmptyMap) -> Self {
         let first = MapProducts::new(None, empty.clone());
-        Self { empty, newest: Mutex::new(Arc::new(first)) }
+        Self { empty, newest: Mutex::new(Arc::new(first)), asked: AtomicBool::new(false) }
+    }
+
+    /// Notes that somebody has asked for the map.
+    pub fn note_asked(&self) {
+        self.asked.store(true, Ordering::Relaxed);
+    }
+
+    /// Makes a new version ready for the next who asks, if somebody asked for the one before.
+    pub fn make_ready(&self, version: &Arc<MapVersion>) {
+        if self.asked.swap(false, Ordering::Relaxed) {
+            let products = self.of(Some(version));
+            let _ready = (products.cdr(), products.label());
+        }
     }
 
     /// The products of this version; those of another are forgotten once nobody uses them.
@@ -293,6 +308,20 @@ mod tests {
 
     fn products() -> MapProducts {
         MapProducts::new(Some(version(7)), empty())
+    }
+
+    #[test]
+    fn a_version_is_made_ready_once_somebody_asked_for_one() {
+        let cache = ProductCache::new(empty());
+        let made = |number| {
+            let version = version(number);
+            cache.make_ready(&version);
+            cache.of(Some(&version)).cdr.get().is_some()
+        };
+        assert!(!made(1));
+        cache.note_asked();
+        assert!(made(2));
+        assert!(!made(3), "nobody asked for version 2");
     }
 
     #[test]

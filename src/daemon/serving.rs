@@ -14,6 +14,7 @@ use zenoh::{Session, Wait as _};
 
 use super::answers::Responder;
 use super::command::Request;
+use super::formats::ProductCache;
 use super::keys::KeyError;
 use super::ledger::Entry;
 use super::outputs;
@@ -152,6 +153,7 @@ impl Serving {
         let mut tasks = JoinSet::new();
         declare.maps(&settings, &snapshots, &responder.products(), &mut tasks).await?;
         declare.estimates(&settings, &snapshots, &mut tasks).await?;
+        tasks.spawn(keep_ready(responder.products(), snapshots.clone()));
         declare.transform(settings, snapshots, &mut tasks).await?;
         declare.diagnostics(status, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
@@ -184,5 +186,17 @@ impl Serving {
         if tokio::time::timeout(LONGEST_STOP, stop).await.is_err() {
             tracing::debug!("stopped while something was being sent");
         }
+    }
+}
+
+/// Encodes each new map that will be asked for, so that whoever asks first does not wait for it.
+async fn keep_ready(products: Arc<ProductCache>, mut snapshots: watch::Receiver<Arc<Snapshot>>) {
+    let mut version = 0;
+    while snapshots.changed().await.is_ok() {
+        let newest = snapshots.borrow_and_update().map.clone();
+        let Some(newest) = newest.filter(|map| map.version != version) else { continue };
+        version = newest.version;
+        let products = products.clone();
+        spawn_blocking(move || products.make_ready(&newest)).await.ok();
     }
 }
