@@ -19,18 +19,18 @@ use crate::config::Config;
 use crate::convert::{self, OdometrySample};
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
-use crate::slam::gmapping::{
-    GMapping, OdometryUpdate, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason, ThreadsError,
-};
+use crate::slam::engine::{Engine, Sweep};
+use crate::slam::gmapping::ThreadsError;
 use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
+use crate::slam::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipReason};
 
-/// A filter that is fed with readings, and what came of each.
+/// An engine that is fed with readings, and what came of each.
 #[derive(Debug)]
 pub struct Replay {
-    filter: GMapping,
+    engine: Engine,
     mount: Option<LaserMount>,
     track: Track,
     counts: Counts,
@@ -40,13 +40,13 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// A filter as configured, before its first reading.
+    /// An engine as configured, before its first reading.
     ///
     /// # Errors
     /// When the threads cannot be started.
     pub fn new(config: &Config, threads: usize) -> Result<Self, ThreadsError> {
         Ok(Self {
-            filter: GMapping::new(config.parameters(), config.raw.seed, threads)?,
+            engine: Engine::new(config.engine_parameters(), threads)?,
             mount: config.laser_mount(),
             track: Track::default(),
             counts: Counts::default(),
@@ -97,13 +97,13 @@ impl Replay {
 
     /// Ends the replay: the map, and the trajectory as the best particle sees it now.
     #[must_use]
-    pub fn finish(self) -> Outcome {
-        let path = self.filter.path();
+    pub fn finish(mut self) -> Outcome {
+        let path = self.engine.path();
         Outcome {
-            map: self.filter.occupancy_grid(),
+            map: self.engine.occupancy_grid(),
             trajectory: self.track.corrected(&path),
             path,
-            tiles: self.filter.particle_tiles().into(),
+            tiles: self.engine.tiles().into(),
             counts: self.counts,
             sample_sizes: self.sample_sizes,
             resamples: self.resamples,
@@ -113,18 +113,18 @@ impl Replay {
 
     /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
     fn add_odometry(&mut self, stamp: Stamp, odom_from_base: Pose2) -> OdometryUpdate {
-        let step = self.filter.add_odometry(odom_from_base);
+        let step = self.engine.add_odometry(odom_from_base);
         self.track.add(stamp, odom_from_base, step);
         step
     }
 
     fn add_scan(&mut self, scan: &Scan, mount: &LaserMount, odom_from_base: Pose2) -> Verdict {
         let mount = &self.mount.unwrap_or(*mount);
-        let reading = ScanReading { scan, mount, odom_from_base };
+        let sweep = Sweep { scan, mount, odom_from_base: Some(odom_from_base) };
         let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();
         let mut phase_watch = total;
-        let update = self.filter.add_scan(&reading, &mut |phase| {
+        let update = self.engine.add_scan(&sweep, &mut |phase| {
             let spent = phase_watch.lap();
             let sum = &mut phases[phase_index(phase)];
             sum.wall += spent.wall;

@@ -55,6 +55,9 @@ pub(crate) struct Arguments {
     /// Set a key of the configuration; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Which system maps; the same as --set engine=ENGINE
+    #[arg(long, value_name = "ENGINE")]
+    engine: Option<String>,
     /// Seed of the random numbers; the same as --set seed=N
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -105,6 +108,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
     let mut overrides = arguments.set.clone();
+    overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
     let config = Config::load(arguments.config.as_deref(), &overrides)?;
     for warning in &config.warnings {

@@ -52,6 +52,9 @@ pub(crate) struct Arguments {
     /// Set a key of the configuration; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Which system maps; the same as --set engine=ENGINE
+    #[arg(long, value_name = "ENGINE")]
+    engine: Option<String>,
     /// Seed of the random numbers; the same as --set seed=N
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -92,6 +95,7 @@ fn start_log() -> anyhow::Result<()> {
 
 fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
     let mut overrides = arguments.set.clone();
+    overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
     let config = Config::load(arguments.config.as_deref(), &overrides)?;
     for warning in &config.warnings {

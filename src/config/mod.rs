@@ -13,16 +13,17 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub use raw::{
-    Interop, Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, RosDistro, Smoothing,
+    EngineKind, Interop, Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, RosDistro,
+    Smoothing,
 };
 pub use source::Origin;
 
+use crate::slam::engine::EngineParameters;
 use crate::slam::gmapping::{
-    JumpGuard, JumpPolicy, MapParameters, MatcherKind, MatcherParameters, Parameters,
-    WeightSmoothing, Weighting,
+    MapParameters, MatcherKind, MatcherParameters, Parameters, WeightSmoothing, Weighting,
 };
 use crate::slam::motion_gate::MotionGate;
-use crate::slam::odometry::MotionNoise;
+use crate::slam::odometry::{JumpGuard, JumpPolicy, MotionNoise};
 use crate::slam::pose::Pose2;
 use crate::slam::scan::{LaserMount, MountOrientation};
 use source::Entries;
@@ -57,7 +58,15 @@ impl Config {
         Ok(Self { raw, warnings })
     }
 
-    /// What the filter is told.
+    /// Which engine runs, and what it is told.
+    #[must_use]
+    pub fn engine_parameters(&self) -> EngineParameters {
+        match self.raw.engine {
+            EngineKind::Gmapping => EngineParameters::GMapping(self.parameters(), self.raw.seed),
+        }
+    }
+
+    /// What the particle filter is told.
     #[must_use]
     pub fn parameters(&self) -> Parameters {
         let raw = &self.raw;

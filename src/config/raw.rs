@@ -11,6 +11,8 @@ use crate::slam::gmapping::Parameters;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RawConfig {
+    /// Which system maps.
+    pub engine: EngineKind,
     /// Number of hypotheses.
     pub particles: usize,
     /// Every n-th scan is looked at.
@@ -169,6 +171,7 @@ impl Default for RawConfig {
     fn default() -> Self {
         let core = Parameters::default();
         Self {
+            engine: EngineKind::Gmapping,
             particles: core.particles,
             throttle_scans: core.throttle_scans,
             base_frame: "base_link".to_owned(),
@@ -228,6 +231,14 @@ impl Default for RawConfig {
             lasamplestep: 0.005,
         }
     }
+}
+
+/// Which system maps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EngineKind {
+    /// A particle filter.
+    Gmapping,
 }
 
 /// How the laser sits on the robot.

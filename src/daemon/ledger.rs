@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use crate::slam::gmapping::SkipReason;
 use crate::slam::pose::Stamp;
+use crate::slam::update::SkipReason;
 
 /// What became of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]

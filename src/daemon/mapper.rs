@@ -16,10 +16,11 @@ use super::snapshot::{Estimate, MapVersion, Snapshot};
 use super::synchronizer::{self, Call, Channel, ReadyScan, Refusal, ScanCounts, Synchronizer};
 use crate::clock::{self, Stopwatch};
 use crate::config::Config;
-use crate::slam::gmapping::{
-    GMapping, JumpGuard, OdometryUpdate, ScanReading, ScanReport, ScanUpdate, ThreadsError,
-};
+use crate::slam::engine::{Engine, Sweep};
+use crate::slam::gmapping::ThreadsError;
+use crate::slam::odometry::JumpGuard;
 use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate};
 use crate::statistics::Spread;
 use crate::tf::{Kind, TfCounts, Transform};
 use crate::timeline::TimelineCounts;
@@ -74,11 +75,10 @@ pub struct Gauges {
 #[derive(Debug)]
 pub struct Mapper {
     connections: Connections,
-    filter: GMapping,
+    engine: Engine,
     /// As configured: where the first scan is, and what a jump is.
     initial_pose: Option<Pose2>,
     jump: JumpGuard,
-    occupied_threshold: f64,
     /// Seconds between two versions of the map while scans wait.
     map_update_interval: f64,
     synchronizer: Synchronizer,
@@ -170,8 +170,7 @@ impl Mapper {
             connections,
             initial_pose: parameters.initial_pose,
             jump: parameters.jump,
-            occupied_threshold: parameters.map.occupied_threshold,
-            filter: GMapping::new(parameters, config.raw.seed, threads)?,
+            engine: Engine::new(config.engine_parameters(), threads)?,
             map_update_interval: config.raw.map_update_interval,
             synchronizer: synchronizer(config, keys),
             frames: frames(config, keys),
@@ -276,7 +275,7 @@ impl Mapper {
     }
 
     fn add_odometry(&mut self, odom_from_base: Pose2) {
-        match self.filter.add_odometry(odom_from_base) {
+        match self.engine.add_odometry(odom_from_base) {
             OdometryUpdate::Accepted => {}
             OdometryUpdate::JumpRejected => self.gauges.odometry_jumps += 1,
             OdometryUpdate::NotUsable => return,
@@ -288,9 +287,9 @@ impl Mapper {
         let ReadyScan { scan, mount, odom_from_base } = ready;
         // Interpolated odometry passes the jump guard too; the scan's own counts no second time.
         self.add_odometry(*odom_from_base);
-        let reading = ScanReading { scan, mount, odom_from_base: *odom_from_base };
+        let sweep = Sweep { scan, mount, odom_from_base: Some(*odom_from_base) };
         let watch = Stopwatch::start();
-        match self.filter.add_scan(&reading, &mut |_| ()) {
+        match self.engine.add_scan(&sweep, &mut |_| ()) {
             ScanUpdate::Processed(report) => {
                 self.count_time(watch.elapsed().wall, scan.stamp);
                 self.processed(scan.stamp, report);
@@ -317,11 +316,11 @@ impl Mapper {
 
     fn processed(&mut self, stamp: Stamp, report: ScanReport) {
         self.view.resamples += u64::from(report.resampled);
-        let particles = self.filter.particles();
-        let share = report.matched as f64 / particles.len().max(1) as f64;
+        let hypotheses = self.engine.hypotheses();
+        let share = report.matched as f64 / hypotheses.len().max(1) as f64;
         push_bounded(&mut self.gauges.matched, share, RECENT);
-        self.view.estimate.particles = particles.iter().map(|p| p.pose_in_map()).collect();
-        self.view.estimate.covariance = self.filter.cloud_covariance();
+        self.view.estimate.particles = hypotheses.into();
+        self.view.estimate.covariance = self.engine.covariance();
         self.view.estimate.report = Some(report);
         self.renew_estimate(Some(stamp));
         self.view.unpublished = Some(stamp);
@@ -335,9 +334,9 @@ impl Mapper {
     /// The pose as the filter has it, and odometry that it has not got yet.
     fn renew_estimate(&mut self, stamp: Option<Stamp>) {
         let estimate = &mut self.view.estimate;
-        estimate.pose_in_map = self.filter.pose_in_map();
-        estimate.map_from_odom = self.filter.map_from_odom();
-        estimate.stamp = if self.filter.particles().is_empty() { None } else { stamp };
+        estimate.pose_in_map = self.engine.pose_in_map();
+        estimate.map_from_odom = self.engine.map_from_odom();
+        estimate.stamp = if self.engine.has_begun() { stamp } else { None };
         self.view.changed = true;
         self.follow_odometry();
     }
@@ -349,9 +348,9 @@ impl Mapper {
         self.view.map = Some(Arc::new(MapVersion {
             version: self.view.version,
             stamp,
-            occupancy: self.filter.occupancy().clone(),
-            occupied_threshold: self.occupied_threshold,
-            path: self.filter.path(),
+            occupancy: self.engine.occupancy().clone(),
+            occupied_threshold: self.engine.occupied_threshold(),
+            path: self.engine.path(),
         }));
     }
 
@@ -396,7 +395,7 @@ impl Mapper {
     }
 
     fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
-        self.filter.reset(pose_in_map.or(self.initial_pose));
+        self.engine.reset(pose_in_map.or(self.initial_pose));
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
         self.view.paused = before.paused;
@@ -411,11 +410,10 @@ impl Mapper {
     }
 
     fn set_pose(&mut self, pose_in_map: Pose2) -> (String, bool) {
-        let mapping = !self.filter.particles().is_empty();
-        self.filter.set_pose(pose_in_map);
+        let mapping = self.engine.has_begun();
+        self.engine.set_pose(pose_in_map);
         let stamp = self.view.estimate.stamp;
-        self.view.estimate.particles =
-            self.filter.particles().iter().map(|p| p.pose_in_map()).collect();
+        self.view.estimate.particles = self.engine.hypotheses().into();
         self.renew_estimate(stamp);
         let place = in_words(pose_in_map);
         if mapping {

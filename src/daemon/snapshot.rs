@@ -6,10 +6,10 @@ use nalgebra::Matrix3;
 use serde::Serialize;
 
 use super::ledger::Ledger;
-use crate::slam::gmapping::ScanReport;
 use crate::slam::grid::occupancy::OccupancyMap;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::update::ScanReport;
 use crate::statistics::Spread;
 
 /// What the filter knew at one moment.

@@ -8,8 +8,8 @@ use super::{Outcome, ScanTimes, Times, Verdict, phase_index};
 use crate::clock::{Elapsed, peak_resident_memory};
 use crate::config::{Config, RawConfig};
 use crate::logs::LogStatistics;
-use crate::slam::gmapping::{OdometryUpdate, Phase};
 use crate::slam::grid::tile_map::TileCounts;
+use crate::slam::update::{OdometryUpdate, Phase};
 use crate::statistics::Spread;
 
 /// The figures of a replay; `summary.json` is this.

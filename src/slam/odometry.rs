@@ -9,6 +9,8 @@ use super::pose::Pose2;
 /// The original applies them to each message. This is the step of a robot at a quarter of a metre
 /// a second that reports at 10 Hz; in the Intel log of the original's authors it is 0.037 m.
 const REFERENCE_STEP: f64 = 0.025;
+/// Odometry further from its origin than this is not a robot's, m.
+const FURTHEST: f64 = 1e7;
 /// Share of the noise along an axis that travel along the other axis adds, as in the original.
 const CROSS_AXIS: f64 = 0.3;
 
@@ -61,6 +63,45 @@ impl MotionNoise {
             ]),
         ]
     }
+}
+
+/// What happens when odometry moves further between two readings than a robot can.
+///
+/// The original prints a banner and believes the jump.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JumpGuard {
+    /// Metres between two successive odometry readings that count as a jump.
+    pub max_step: f64,
+    /// What then happens.
+    pub policy: JumpPolicy,
+}
+
+impl Default for JumpGuard {
+    fn default() -> Self {
+        Self { max_step: 20.0, policy: JumpPolicy::Reject }
+    }
+}
+
+impl JumpGuard {
+    /// Whether a step is to be taken out.
+    #[must_use]
+    pub fn rejects(&self, step: Pose2) -> bool {
+        self.policy == JumpPolicy::Reject && step.position().norm() > self.max_step
+    }
+
+    /// Whether a pose can be a robot's at all.
+    pub(super) fn is_usable(&self, odom_from_base: Pose2) -> bool {
+        odom_from_base.is_finite() && odom_from_base.position().norm() <= FURTHEST
+    }
+}
+
+/// What to do with a reading that jumped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum JumpPolicy {
+    /// The jump is taken out: the robot is believed not to have moved meanwhile.
+    Reject,
+    /// The jump is believed.
+    Continue,
 }
 
 /// The motion of the base between two moments, as odometry tells it.

@@ -23,7 +23,7 @@ use rayon::iter::{
 use thiserror::Error;
 
 use self::output_map::OutputMap;
-pub use self::parameters::{JumpGuard, JumpPolicy, MapParameters, Parameters};
+pub use self::parameters::{MapParameters, Parameters};
 pub use self::particle::Particle;
 use self::particle::{ScanMatcher, Step};
 use self::prepared_scan::PreparedScan;
@@ -34,9 +34,10 @@ use self::trajectory::{NodeId, TrajectoryTree};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
 use super::odometry::Motion;
+pub use super::odometry::{JumpGuard, JumpPolicy};
 use super::path::Path;
 use super::pose::{Pose2, Stamp, wrap_angle};
-use super::scan::{LaserMount, Scan};
+pub use super::update::{OdometryUpdate, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason};
 
 /// Particles a thread takes at a time; fewer are not worth handing over.
 const PARTICLES_A_TASK: usize = 4;
@@ -46,80 +47,6 @@ const PARTICLES_A_TASK: usize = 4;
 /// Weights of nearly equal particles take turns at being the largest; without this the map and the
 /// pose would jump between them, and the output map would be rebuilt over and over.
 const CLEARLY_BETTER: f64 = 2.0 * std::f64::consts::LN_2;
-
-/// A scan with all that is needed to use it.
-#[derive(Debug, Clone, Copy)]
-pub struct ScanReading<'a> {
-    /// The sweep.
-    pub scan: &'a Scan,
-    /// How the laser sits on the robot.
-    pub mount: &'a LaserMount,
-    /// Where odometry says the base was when the sweep was taken.
-    pub odom_from_base: Pose2,
-}
-
-/// What became of an odometry reading.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum OdometryUpdate {
-    /// Its motion counts.
-    Accepted,
-    /// It moved further than [`JumpGuard::max_step`]; the step was taken out.
-    JumpRejected,
-    /// It is not finite, or further from the origin than any robot gets; it was ignored.
-    NotUsable,
-}
-
-/// What became of a scan.
-#[derive(Debug, Clone, PartialEq)]
-pub enum ScanUpdate {
-    /// It is in the map.
-    Processed(ScanReport),
-    /// It is not, for this reason.
-    Skipped(SkipReason),
-}
-
-/// Figures about a processed scan.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ScanReport {
-    /// Hits that were matched.
-    pub hits: usize,
-    /// Particles whose match was accepted; the others went on with odometry.
-    pub matched: usize,
-    /// Score of the best particle's match, up to `hits`.
-    pub best_score: f64,
-    /// 1 / Σ wᵢ² before resampling, between 1 and the number of particles.
-    pub effective_sample_size: f64,
-    /// −Σ wᵢ ln wᵢ before resampling, nats.
-    pub entropy: f64,
-    /// Whether particles were drawn anew.
-    pub resampled: bool,
-}
-
-/// Why a scan was not processed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SkipReason {
-    /// Not the n-th scan that `throttle_scans` asks for.
-    Throttled,
-    /// The motion gate is closed.
-    NotMovedEnough,
-    /// No beam is a hit within `maxUrange`.
-    NoUsableBeams,
-    /// The odometry pose is not usable.
-    BadOdometry,
-}
-
-/// The parts of processing a scan, in order; reported when each ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Phase {
-    /// Scan matching and weighting of all particles.
-    Match,
-    /// Normalisation, resampling and the trajectory tree.
-    Resample,
-    /// The scan enters each particle's map.
-    Register,
-    /// The scan enters the output map; with several threads while it enters those of the particles.
-    Map,
-}
 
 /// The worker threads could not be started.
 #[derive(Debug, Error)]
@@ -321,6 +248,8 @@ impl GMapping {
             effective_sample_size,
             entropy: resampling::entropy(&weights),
             resampled: effective_sample_size < threshold || disputed > HISTORY + HISTORY / 4,
+            registered: true,
+            weak_direction: None,
         };
         if report.resampled {
             let weights =
@@ -480,6 +409,12 @@ impl GMapping {
     #[must_use]
     pub const fn occupancy(&self) -> &OccupancyMap {
         self.output.map()
+    }
+
+    /// A cell is occupied when its hits / visits is above this.
+    #[must_use]
+    pub const fn occupied_threshold(&self) -> f64 {
+        self.parameters.map.occupied_threshold
     }
 
     /// The map of the best particle, cropped to what is known; `None` before the first scan.

@@ -1,13 +1,10 @@
 //! Everything the filter can be told; what belongs to one part of it is described there.
 
 use super::super::motion_gate::MotionGate;
-use super::super::odometry::MotionNoise;
+use super::super::odometry::{JumpGuard, MotionNoise};
 use super::super::pose::Pose2;
 use super::resampling::Weighting;
 use super::scan_matcher::MatcherParameters;
-
-/// Odometry further from its origin than this is not a robot's, m.
-const FURTHEST: f64 = 1e7;
 
 /// The filter's parameters; the defaults are slam_gmapping's where it has them.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,45 +52,6 @@ impl Default for Parameters {
             map: MapParameters::default(),
         }
     }
-}
-
-/// What happens when odometry moves further between two readings than a robot can.
-///
-/// The original prints a banner and believes the jump.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct JumpGuard {
-    /// Metres between two successive odometry readings that count as a jump.
-    pub max_step: f64,
-    /// What then happens.
-    pub policy: JumpPolicy,
-}
-
-impl Default for JumpGuard {
-    fn default() -> Self {
-        Self { max_step: 20.0, policy: JumpPolicy::Reject }
-    }
-}
-
-impl JumpGuard {
-    /// Whether a step is to be taken out.
-    #[must_use]
-    pub fn rejects(&self, step: Pose2) -> bool {
-        self.policy == JumpPolicy::Reject && step.position().norm() > self.max_step
-    }
-
-    /// Whether a pose can be a robot's at all.
-    pub(super) fn is_usable(&self, odom_from_base: Pose2) -> bool {
-        odom_from_base.is_finite() && odom_from_base.position().norm() <= FURTHEST
-    }
-}
-
-/// What to do with a reading that jumped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum JumpPolicy {
-    /// The jump is taken out: the robot is believed not to have moved meanwhile.
-    Reject,
-    /// The jump is believed.
-    Continue,
 }
 
 /// The occupancy map that is handed out.

@@ -1,0 +1,172 @@
+//! The mapping systems, one of which runs.
+
+use nalgebra::Matrix3;
+
+use super::gmapping::{GMapping, Parameters, ThreadsError};
+use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
+use super::grid::tile_map::TileCounts;
+use super::path::Path;
+use super::pose::Pose2;
+use super::scan::{LaserMount, Scan};
+use super::update::{OdometryUpdate, Phase, ScanReading, ScanUpdate, SkipReason};
+
+/// Which system maps, with its parameters.
+#[derive(Debug, Clone, PartialEq)]
+pub enum EngineParameters {
+    /// A particle filter, with the seed of its random numbers.
+    GMapping(Parameters, u64),
+}
+
+/// A system that makes a map and a path of scans and odometry.
+#[derive(Debug)]
+pub enum Engine {
+    /// A particle filter.
+    GMapping(Box<GMapping>),
+}
+
+/// A scan with what there is to use it.
+#[derive(Debug, Clone, Copy)]
+pub struct Sweep<'a> {
+    /// The sweep.
+    pub scan: &'a Scan,
+    /// How the laser sits on the robot.
+    pub mount: &'a LaserMount,
+    /// Where odometry says the base was when the sweep was taken; `None` where there is none.
+    pub odom_from_base: Option<Pose2>,
+}
+
+impl Engine {
+    /// An engine with no scan yet. `threads` of 1 or 0 runs everything on the caller's thread.
+    ///
+    /// # Errors
+    /// When the threads cannot be started.
+    pub fn new(parameters: EngineParameters, threads: usize) -> Result<Self, ThreadsError> {
+        match parameters {
+            EngineParameters::GMapping(parameters, seed) => {
+                Ok(Self::GMapping(Box::new(GMapping::new(parameters, seed, threads)?)))
+            }
+        }
+    }
+
+    /// Whether scans without odometry are of no use to it.
+    #[must_use]
+    pub const fn needs_odometry(&self) -> bool {
+        match self {
+            Self::GMapping(_) => true,
+        }
+    }
+
+    /// Forgets map and path, as if nothing had been read: the next scan is the first, at
+    /// `initial_pose` in `map`, or where odometry says.
+    pub fn reset(&mut self, initial_pose: Option<Pose2>) {
+        match self {
+            Self::GMapping(filter) => filter.reset(initial_pose),
+        }
+    }
+
+    /// Says where the base is in `map`: before the first scan, where the map begins; later, the
+    /// robot is moved, and the map stays where it is.
+    pub fn set_pose(&mut self, pose_in_map: Pose2) {
+        match self {
+            Self::GMapping(filter) => filter.set_pose(pose_in_map),
+        }
+    }
+
+    /// Takes an odometry reading: the base in `odom`.
+    pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
+        match self {
+            Self::GMapping(filter) => filter.add_odometry(odom_from_base),
+        }
+    }
+
+    /// Takes a scan; `on_phase` is called as each phase of processing ends.
+    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: &mut dyn FnMut(Phase)) -> ScanUpdate {
+        let &Sweep { scan, mount, odom_from_base } = sweep;
+        match (self, odom_from_base) {
+            (Self::GMapping(filter), Some(odom_from_base)) => {
+                filter.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
+            }
+            (Self::GMapping(_), None) => ScanUpdate::Skipped(SkipReason::BadOdometry),
+        }
+    }
+
+    /// The base in `map` at the last processed scan, with odometry since; the initial pose before
+    /// the first scan.
+    #[must_use]
+    pub fn pose_in_map(&self) -> Pose2 {
+        match self {
+            Self::GMapping(filter) => filter.pose_in_map(),
+        }
+    }
+
+    /// What takes odometry poses to the map; the identity before the first scan and without
+    /// odometry.
+    #[must_use]
+    pub fn map_from_odom(&self) -> Pose2 {
+        match self {
+            Self::GMapping(filter) => filter.map_from_odom(),
+        }
+    }
+
+    /// How sure the pose of the last processed scan is: m², m rad, rad².
+    #[must_use]
+    pub fn covariance(&self) -> Matrix3<f64> {
+        match self {
+            Self::GMapping(filter) => filter.cloud_covariance(),
+        }
+    }
+
+    /// The base in `map` as each hypothesis has it; none before the first scan.
+    #[must_use]
+    pub fn hypotheses(&self) -> Vec<Pose2> {
+        match self {
+            Self::GMapping(filter) => filter.particles().iter().map(|p| p.pose_in_map()).collect(),
+        }
+    }
+
+    /// Whether a scan has been processed.
+    #[must_use]
+    pub fn has_begun(&self) -> bool {
+        match self {
+            Self::GMapping(filter) => !filter.particles().is_empty(),
+        }
+    }
+
+    /// The pose of the base at each processed scan as it is known now, oldest first.
+    #[must_use]
+    pub fn path(&self) -> Path {
+        match self {
+            Self::GMapping(filter) => filter.path(),
+        }
+    }
+
+    /// Hits and visits of each cell.
+    pub fn occupancy(&mut self) -> &OccupancyMap {
+        match self {
+            Self::GMapping(filter) => filter.occupancy(),
+        }
+    }
+
+    /// A cell is occupied when its hits / visits is above this.
+    #[must_use]
+    pub fn occupied_threshold(&self) -> f64 {
+        match self {
+            Self::GMapping(filter) => filter.occupied_threshold(),
+        }
+    }
+
+    /// The map, cropped to what is known; `None` before the first scan.
+    #[must_use]
+    pub fn occupancy_grid(&mut self) -> Option<OccupancyGrid> {
+        let threshold = self.occupied_threshold();
+        self.occupancy().to_grid(threshold)
+    }
+
+    /// The tiles of the maps that scans are matched with.
+    #[must_use]
+    pub fn tiles(&self) -> TileCounts {
+        match self {
+            Self::GMapping(filter) => filter.particle_tiles(),
+        }
+    }
+}
