@@ -8,7 +8,7 @@ use super::grid::tile_map::TileCounts;
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
-use super::update::{OdometryUpdate, Phase, ScanReading, ScanUpdate, SkipReason};
+use super::update::{OdometryUpdate, OnPhase, ScanReading, ScanUpdate, SkipReason};
 
 /// Which system maps, with its parameters.
 #[derive(Debug, Clone, PartialEq)]
@@ -80,7 +80,7 @@ impl Engine {
     }
 
     /// Takes a scan; `on_phase` is called as each phase of processing ends.
-    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: &mut dyn FnMut(Phase)) -> ScanUpdate {
+    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: OnPhase<'_>) -> ScanUpdate {
         let &Sweep { scan, mount, odom_from_base } = sweep;
         match (self, odom_from_base) {
             (Self::GMapping(filter), Some(odom_from_base)) => {

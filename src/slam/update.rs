@@ -95,3 +95,6 @@ pub enum Phase {
     /// The scan enters the output map; with several threads while it enters those of the particles.
     Map,
 }
+
+/// Called as each phase of processing a scan ends.
+pub type OnPhase<'a> = &'a mut (dyn FnMut(Phase) + Send);

@@ -15,6 +15,7 @@ pub mod scan_matcher;
 pub mod trajectory;
 
 use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 
 use nalgebra::Matrix3;
 use rayon::iter::{
@@ -37,10 +38,9 @@ use super::odometry::Motion;
 pub use super::odometry::{JumpGuard, JumpPolicy};
 use super::path::Path;
 use super::pose::{Pose2, Stamp, wrap_angle};
-pub use super::update::{OdometryUpdate, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason};
-
-/// Particles a thread takes at a time; fewer are not worth handing over.
-const PARTICLES_A_TASK: usize = 4;
+pub use super::update::{
+    OdometryUpdate, OnPhase, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason,
+};
 
 /// A particle must be this much likelier than the best one to take its place, in nats: four times.
 ///
@@ -69,7 +69,7 @@ pub struct GMapping {
     parameters: Parameters,
     streams: Streams,
     /// `None` runs everything on the caller's thread.
-    pool: Option<rayon::ThreadPool>,
+    pool: Option<Arc<rayon::ThreadPool>>,
     matcher: ScanMatcher,
     /// Empty before the first scan.
     particles: Vec<Particle>,
@@ -103,7 +103,7 @@ impl GMapping {
         let pool = (threads > 1).then(|| builder.build()).transpose();
         Ok(Self {
             streams: Streams::new(seed),
-            pool: pool.map_err(|source| ThreadsError { threads, source })?,
+            pool: pool.map_err(|source| ThreadsError { threads, source })?.map(Arc::new),
             matcher: ScanMatcher::new(parameters.matcher, parameters.resolution),
             particles: Vec::new(),
             best: 0,
@@ -162,31 +162,42 @@ impl GMapping {
     }
 
     /// Takes a scan; `on_phase` is called as each phase of processing ends.
-    pub fn add_scan(
-        &mut self,
-        reading: &ScanReading<'_>,
-        on_phase: &mut dyn FnMut(Phase),
-    ) -> ScanUpdate {
+    pub fn add_scan(&mut self, reading: &ScanReading<'_>, on_phase: OnPhase<'_>) -> ScanUpdate {
         let scan = match self.admit(reading) {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
-        let motion = std::mem::take(&mut self.odometry.since_processed);
         self.stamps.push_back(reading.scan.stamp);
+        let odom_from_base = reading.odom_from_base;
+        // On one of the pool's threads, so that only the others have to be woken.
+        let report = match self.pool.clone() {
+            Some(pool) => pool.install(|| self.process(&scan, odom_from_base, on_phase)),
+            None => self.process(&scan, odom_from_base, on_phase),
+        };
+        ScanUpdate::Processed(report)
+    }
+
+    fn process(
+        &mut self,
+        scan: &PreparedScan,
+        odom_from_base: Pose2,
+        on_phase: OnPhase<'_>,
+    ) -> ScanReport {
+        let motion = std::mem::take(&mut self.odometry.since_processed);
         if self.particles.is_empty() {
-            self.begin(reading.odom_from_base);
+            self.begin(odom_from_base);
         } else {
-            self.match_particles(&scan, motion);
+            self.match_particles(scan, motion);
         }
         on_phase(Phase::Match);
         let report = self.resample(scan.hits.len());
         on_phase(Phase::Resample);
-        self.register(&scan, on_phase);
+        self.register(scan, on_phase);
         if report.resampled || self.particles.len() == 1 {
             self.settle();
         }
         on_phase(Phase::Map);
-        ScanUpdate::Processed(report)
+        report
     }
 
     /// The scan made ready, if it is to be processed.
@@ -225,7 +236,7 @@ impl GMapping {
             number: self.processed(),
         };
         let (matcher, streams) = (&self.matcher, &self.streams);
-        for_each(self.pool.as_ref(), &mut self.particles, |index, particle| {
+        for_each(self.pool.as_deref(), &mut self.particles, |index, particle| {
             particle.advance(matcher, &step, streams, index);
         });
         for particle in &mut self.particles {
@@ -272,12 +283,12 @@ impl GMapping {
 
     /// Enters the scan in each particle's map, and in the output map at the same time if there are
     /// threads.
-    fn register(&mut self, scan: &PreparedScan, on_phase: &mut dyn FnMut(Phase)) {
+    fn register(&mut self, scan: &PreparedScan, on_phase: OnPhase<'_>) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
         let outline = scan.outline.clone();
         let Self { matcher, particles, output, tree, pool, .. } = self;
         let mut register = || {
-            for_each(pool.as_ref(), particles, |_, particle| matcher.register(particle, scan));
+            for_each(pool.as_deref(), particles, |_, particle| matcher.register(particle, scan));
         };
         let extend = || output.extend(tree, best, outline);
         if let Some(pool) = &*pool {
@@ -457,7 +468,7 @@ fn for_each(
         return;
     };
     pool.install(|| {
-        let particles = particles.par_iter_mut().with_min_len(PARTICLES_A_TASK).enumerate();
+        let particles = particles.par_iter_mut().enumerate();
         particles.for_each(|(index, particle)| work(index, particle));
     });
 }
