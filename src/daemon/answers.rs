@@ -17,6 +17,7 @@ use super::save::{SaveError, SaveName, Saver};
 use super::selector::{MapFormat, MessageFormat, PathFormat, Question, SelectorError};
 use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
+use super::tiles::{TileSet, TileStore};
 use crate::convert;
 use crate::ros;
 use crate::slam::path::Path;
@@ -30,7 +31,8 @@ const LONGEST_COMMAND: Duration = Duration::from_secs(5);
 /// What a reply carries.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Answer {
-    pub(super) payload: Bytes,
+    /// One after the other; mostly there is one.
+    pub(super) payloads: Vec<Bytes>,
     pub(super) encoding: Encoding,
     pub(super) attachment: Option<Bytes>,
 }
@@ -81,6 +83,7 @@ pub(super) struct Responder {
     status: AskStatus,
     commands: mpsc::Sender<Request>,
     products: Arc<ProductCache>,
+    tiles: Arc<TileStore>,
     saver: Saver,
     map_frame: String,
 }
@@ -88,12 +91,15 @@ pub(super) struct Responder {
 impl Responder {
     pub(super) fn new(
         settings: &Settings,
+        run: u64,
         snapshots: watch::Receiver<Arc<Snapshot>>,
         status: AskStatus,
         commands: mpsc::Sender<Request>,
     ) -> Self {
+        let tiles = TileSet::new(run, settings.resolution);
         let empty = EmptyMap { frame: settings.map_frame.clone(), resolution: settings.resolution };
         Self {
+            tiles: Arc::new(TileStore::new(tiles, snapshots.clone())),
             snapshots,
             status,
             commands,
@@ -108,13 +114,18 @@ impl Responder {
         self.products.clone()
     }
 
+    /// The tiles, for those who publish them.
+    pub(super) fn tiles(&self) -> Arc<TileStore> {
+        self.tiles.clone()
+    }
+
     /// Answers; blocks while something is encoded, written, or done by the filter.
     pub(super) fn answer(&self, question: &Question) -> Result<Answer, Refusal> {
         let snapshot = self.snapshots.borrow().clone();
         match question {
             Question::Map(format) => self.map(&snapshot, *format),
             Question::DynamicMap => Ok(Answer {
-                payload: self.products_of(&snapshot).cdr(),
+                payloads: vec![self.products_of(&snapshot).cdr()],
                 encoding: cdr_of::<ros::GetMapResponse>(),
                 attachment: None,
             }),
@@ -125,7 +136,7 @@ impl Responder {
             }
             Question::Pose { at, format } => Ok(message(&self.pose(&snapshot, *at)?, *format)),
             Question::Path(format) => Ok(Answer {
-                payload: self.products_of(&snapshot).path_in(*format),
+                payloads: vec![self.products_of(&snapshot).path_in(*format)],
                 encoding: path_encoding(*format),
                 attachment: None,
             }),
@@ -136,6 +147,11 @@ impl Responder {
                 let report = snapshot.estimate.report.as_ref().ok_or(Refusal::NoEntropy)?;
                 Ok(message(&ros::Float64 { data: report.entropy }, *format))
             }
+            Question::Tiles(question) => Ok(Answer {
+                payloads: self.tiles.newest(|tiles| tiles.answer(question)),
+                encoding: Encoding::APPLICATION_OCTET_STREAM,
+                attachment: None,
+            }),
             Question::Status => Ok(json(&self.status.status())),
             Question::Reset(pose) => self.command(Command::Reset(*pose)),
             Question::Pause => self.command(Command::Pause),
@@ -152,7 +168,7 @@ impl Responder {
     fn map(&self, snapshot: &Snapshot, format: MapFormat) -> Result<Answer, Refusal> {
         let products = self.products_of(snapshot);
         Ok(Answer {
-            payload: products.map(format, snapshot.estimate.pose_in_map)?,
+            payloads: vec![products.map(format, snapshot.estimate.pose_in_map)?],
             encoding: map_encoding(format),
             attachment: Some(products.attachment()),
         })
@@ -245,12 +261,12 @@ fn message<M: ros::Message>(message: &M, format: MessageFormat) -> Answer {
             (ros::json(message), Encoding::APPLICATION_JSON.with_schema(M::TYPE))
         }
     };
-    Answer { payload: payload.into(), encoding, attachment: None }
+    Answer { payloads: vec![payload.into()], encoding, attachment: None }
 }
 
 fn json(value: &impl Serialize) -> Answer {
     let bytes = serde_json::to_vec(value).expect("memory takes it, and every key is a string");
-    Answer { payload: bytes.into(), encoding: Encoding::APPLICATION_JSON, attachment: None }
+    Answer { payloads: vec![bytes.into()], encoding: Encoding::APPLICATION_JSON, attachment: None }
 }
 
 fn map_encoding(format: MapFormat) -> Encoding {

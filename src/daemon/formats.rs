@@ -284,6 +284,7 @@ mod tests {
         let path = [(Stamp(1_000_000_000), Pose2::IDENTITY)];
         Arc::new(MapVersion {
             version: number,
+            epoch: 1,
             stamp: Stamp(2_500_000_000),
             occupancy,
             occupied_threshold: 0.25,

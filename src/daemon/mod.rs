@@ -27,6 +27,7 @@ pub mod serving;
 pub mod snapshot;
 pub mod status;
 pub mod synchronizer;
+pub mod tiles;
 
 use std::future::Future;
 use std::path::PathBuf;

@@ -25,9 +25,11 @@ use super::formats::{MapProducts, ProductCache};
 use super::ledger::Entry;
 use super::message_clock::MessageClock;
 use super::ros_node::{Output, RosNode, Signature};
-use super::selector::{MessageFormat, PathFormat};
+use super::selector::{MessageFormat, PathFormat, Topic};
 use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
+use super::tiles::TileStore;
+use super::tiles::publishing::TilesOutput;
 use crate::clock::Stopwatch;
 use crate::convert;
 use crate::ros;
@@ -75,6 +77,29 @@ impl Declare<'_> {
             };
             tasks.spawn(output.run(snapshots.clone()));
         }
+        Ok(())
+    }
+
+    /// `slam/tiles`.
+    pub(super) async fn tiles(
+        &self,
+        settings: &Settings,
+        snapshots: &Snapshots,
+        tiles: Arc<TileStore>,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let key = self.node.prefix().key(Topic::Tiles.name())?;
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .encoding(Encoding::APPLICATION_OCTET_STREAM)
+            // What is dropped is asked for by those who miss it.
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::DataLow)
+            .await;
+        let publisher = Arc::new(declared(key, publisher)?);
+        let output = TilesOutput { publisher, tiles, interval: settings.map_update_interval };
+        tasks.spawn(output.run(snapshots.clone()));
         Ok(())
     }
 

@@ -9,6 +9,8 @@ use std::num::NonZeroUsize;
 use thiserror::Error;
 
 use super::save::{NameError, SaveName};
+use super::tiles::TilesQuestion;
+use crate::map::tiles::TileIndex;
 use crate::slam::pose::{Pose2, Stamp, wrap_angle};
 
 /// Columns of a map drawn with characters, unless asked otherwise.
@@ -22,6 +24,11 @@ const FURTHEST: f64 = 1e6;
 
 /// Characters of a query that an error repeats.
 const LONGEST_EXCERPT: usize = 60;
+
+/// Tiles that are asked for by name at once.
+const MOST_WANTED: usize = 1000;
+
+const WANTED: &str = "none, or at most 1000 tiles as COLUMN:ROW with commas between, as in 0:-1,2:3";
 
 const NANOSECOND_DIGITS: usize = 9;
 
@@ -42,6 +49,8 @@ pub enum Topic {
     ParticleCloud,
     /// How undecided the particles are.
     Entropy,
+    /// The map as tiles.
+    Tiles,
     /// How the daemon is.
     Status,
     /// Begin anew.
@@ -58,7 +67,7 @@ pub enum Topic {
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -66,6 +75,7 @@ impl Topic {
         Self::Path,
         Self::ParticleCloud,
         Self::Entropy,
+        Self::Tiles,
         Self::Status,
         Self::Reset,
         Self::Pause,
@@ -85,6 +95,7 @@ impl Topic {
             Self::Path => "path",
             Self::ParticleCloud => "particlecloud",
             Self::Entropy => "entropy",
+            Self::Tiles => "slam/tiles",
             Self::Status => "slam/status",
             Self::Reset => "slam/cmd/reset",
             Self::Pause => "slam/cmd/pause",
@@ -119,6 +130,7 @@ impl Topic {
             Self::Path => Question::Path(path_format(&of(&["format"])?)?),
             Self::ParticleCloud => Question::ParticleCloud(of(&["format"])?.message_format()?),
             Self::Entropy => Question::Entropy(of(&["format"])?.message_format()?),
+            Self::Tiles => Question::Tiles(tiles_question(&of(&["since", "run", "want"])?)?),
             Self::Status => {
                 of(&["format"])?.choice("format", &[("json", ())])?;
                 Question::Status
@@ -161,6 +173,8 @@ pub enum Question {
     ParticleCloud(MessageFormat),
     /// `std_msgs/Float64`.
     Entropy(MessageFormat),
+    /// The map as tiles.
+    Tiles(TilesQuestion),
     /// How the daemon is.
     Status,
     /// Begin anew, with the base at this pose in `map` if there is one.
@@ -250,6 +264,9 @@ pub enum SelectorError {
     /// A width for a format that has none.
     #[error("cols is only for format=text; leave it out, or ask for format=text")]
     ColumnsWithoutText,
+    /// Tiles by version and by place at once.
+    #[error("{0} does not go with want: tiles are asked for by version or by name")]
+    WantBeside(&'static str),
     /// A pose without some of its parts.
     #[error("{0} is missing: a pose needs x and y in metres and yaw in radians")]
     PartOfPose(&'static str),
@@ -396,6 +413,42 @@ fn columns(value: &str) -> Result<NonZeroUsize, SelectorError> {
     })
 }
 
+/// Those after a version, or those that are named.
+fn tiles_question(parameters: &Parameters<'_>) -> Result<TilesQuestion, SelectorError> {
+    let number = |name, value, allowed| SelectorError::NoNumber {
+        name,
+        value: excerpt(value),
+        allowed,
+    };
+    if let Some(value) = parameters.get("want") {
+        if let Some(other) = ["since", "run"].into_iter().find(|n| parameters.get(n).is_some()) {
+            return Err(SelectorError::WantBeside(other));
+        }
+        let error = number("want", value, WANTED);
+        return tile_names(value).map(TilesQuestion::Want).ok_or(error);
+    }
+    let since = parameters.get("since").map(|value| {
+        value.parse().map_err(|_| number("since", value, "the number of a version, 0 for all"))
+    });
+    let run = parameters.get("run").map(|value| {
+        let hexadecimal = value.len() <= 16 && value.bytes().all(|b| b.is_ascii_hexdigit());
+        let run = u64::from_str_radix(value, 16).ok().filter(|_| hexadecimal);
+        run.ok_or_else(|| number("run", value, "at most 16 hexadecimal digits"))
+    });
+    Ok(TilesQuestion::Since { version: since.transpose()?.unwrap_or(0), run: run.transpose()? })
+}
+
+fn tile_names(value: &str) -> Option<Vec<TileIndex>> {
+    if value == "none" {
+        return Some(Vec::new());
+    }
+    let named = value.split(',').map(|name| {
+        let (tx, ty) = name.split_once(':')?;
+        Some(TileIndex { ty: ty.parse().ok()?, tx: tx.parse().ok()? })
+    });
+    named.collect::<Option<Vec<_>>>().filter(|named| named.len() <= MOST_WANTED)
+}
+
 fn path_format(parameters: &Parameters<'_>) -> Result<PathFormat, SelectorError> {
     let choices = [
         ("json", PathFormat::Message(MessageFormat::Json)),
@@ -435,6 +488,8 @@ mod tests {
         assert_eq!(asked(Topic::Path), Ok(Question::Path(PathFormat::Message(json))));
         assert_eq!(asked(Topic::ParticleCloud), Ok(Question::ParticleCloud(json)));
         assert_eq!(asked(Topic::Entropy), Ok(Question::Entropy(json)));
+        let all = TilesQuestion::Since { version: 0, run: None };
+        assert_eq!(asked(Topic::Tiles), Ok(Question::Tiles(all)));
         assert_eq!(asked(Topic::Status), Ok(Question::Status));
         assert_eq!(asked(Topic::Reset), Ok(Question::Reset(None)));
         assert_eq!(asked(Topic::Pause), Ok(Question::Pause));
@@ -512,6 +567,39 @@ mod tests {
             error(Topic::InitialPose, "x=1;y=2;yaw=90"),
             "yaw=\"90\" is not allowed; it must be a number of radians from -6.283 to 6.283"
         );
+    }
+
+    #[test]
+    fn tiles_are_asked_for_by_version_or_by_name() {
+        let asked = |parameters: &str| match Topic::Tiles.question(parameters) {
+            Ok(Question::Tiles(question)) => Ok(question),
+            Ok(other) => panic!("{other:?}"),
+            Err(error) => Err(error.to_string()),
+        };
+        let since = |version, run| Ok(TilesQuestion::Since { version, run });
+        assert_eq!(asked("since=12"), since(12, None));
+        assert_eq!(asked("since=12;run=00ff"), since(12, Some(255)));
+        assert_eq!(asked("want=none"), Ok(TilesQuestion::Want(Vec::new())));
+        let named = vec![TileIndex { ty: -1, tx: 0 }, TileIndex { ty: 3, tx: 2 }];
+        assert_eq!(asked("want=0:-1,2:3"), Ok(TilesQuestion::Want(named)));
+        assert_eq!(
+            asked("want=none;since=3").unwrap_err(),
+            "since does not go with want: tiles are asked for by version or by name"
+        );
+        assert_eq!(
+            asked("since=-1").unwrap_err(),
+            "since=\"-1\" is not allowed; it must be the number of a version, 0 for all"
+        );
+        assert_eq!(
+            asked("want=1").unwrap_err(),
+            "want=\"1\" is not allowed; it must be none, or at most 1000 tiles as COLUMN:ROW \
+             with commas between, as in 0:-1,2:3"
+        );
+        for nonsense in ["run=xyz", "run=+1", "run=", "run=00000000000000001", "want=", "want=1:2,"]
+        {
+            assert!(asked(nonsense).is_err(), "{nonsense}");
+        }
+        assert!(asked(&format!("want={}", "1:1,".repeat(1001).trim_end_matches(','))).is_err());
     }
 
     #[test]

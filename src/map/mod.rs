@@ -4,9 +4,11 @@
 mod bounds;
 mod hash;
 mod json;
+pub mod mirror;
 mod pgm;
 mod picture;
 mod text;
+pub mod tiles;
 
 pub use hash::content_hash;
 pub use json::{NotAMap, json, parse_json};
