@@ -15,6 +15,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
 mod rig;
+mod tiles;
 #[path = "../support/mod.rs"]
 mod support;
 
