@@ -15,6 +15,7 @@ mod judgement;
 pub mod keys;
 pub mod ledger;
 pub mod mailbox;
+mod map_updates;
 pub mod mapper;
 mod message_clock;
 mod outputs;

@@ -156,8 +156,10 @@ impl Serving {
         declare.maps(&settings, &snapshots, &responder.products(), &mut tasks).await?;
         declare.tiles(&settings, &snapshots, responder.tiles(), &mut tasks).await?;
         declare.estimates(&settings, &snapshots, &mut tasks).await?;
-        declare.transform(settings, snapshots, &mut tasks).await?;
+        declare.transform(settings.clone(), snapshots.clone(), &mut tasks).await?;
         declare.diagnostics(status, &mut tasks).await?;
+        let products = responder.products();
+        declare.map_updates(&settings, &snapshots, products, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
         let queryables = Queryables::declare(session, &mut node, responder).await?;
         let announced = node.announce(session).await?;
