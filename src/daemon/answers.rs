@@ -14,7 +14,9 @@ use zenoh::bytes::Encoding;
 use super::command::{Command, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
 use super::save::{SaveError, SaveName, Saver};
-use super::selector::{MapFormat, MessageFormat, PathFormat, Question, SelectorError};
+use super::selector::{
+    MapFormat, MessageFormat, PathFormat, Question, RegionForm, RegionQuestion, SelectorError,
+};
 use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
 use super::tiles::{TileSet, TileStore};
@@ -124,6 +126,7 @@ impl Responder {
         let snapshot = self.snapshots.borrow().clone();
         match question {
             Question::Map(format) => self.map(&snapshot, *format),
+            Question::Region(question) => self.region(&snapshot, question),
             Question::DynamicMap => Ok(Answer {
                 payloads: vec![self.products_of(&snapshot).cdr()],
                 encoding: cdr_of::<ros::GetMapResponse>(),
@@ -172,6 +175,21 @@ impl Responder {
             encoding: map_encoding(format),
             attachment: Some(products.attachment()),
         })
+    }
+
+    fn region(&self, snapshot: &Snapshot, question: &RegionQuestion) -> Result<Answer, Refusal> {
+        let products = self.products_of(snapshot);
+        let (payload, encoding) = match &question.form {
+            RegionForm::Layers(layers) => {
+                (products.layers(question, layers)?, Encoding::APPLICATION_JSON)
+            }
+            RegionForm::Map(format) => {
+                let region = products.region(question)?;
+                let robot_in_map = snapshot.estimate.pose_in_map;
+                (region.map(*format, robot_in_map)?, map_encoding(*format))
+            }
+        };
+        Ok(Answer { payloads: vec![payload], encoding, attachment: Some(products.attachment()) })
     }
 
     fn pose(

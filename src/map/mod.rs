@@ -7,6 +7,7 @@ mod json;
 pub mod mirror;
 mod pgm;
 mod picture;
+pub mod region;
 mod text;
 pub mod tiles;
 
