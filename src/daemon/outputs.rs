@@ -35,8 +35,8 @@ use crate::clock::Stopwatch;
 use crate::convert;
 use crate::ros;
 use crate::ros::graph::{
-    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, OCCUPANCY_GRID_UPDATE, PATH, POSE_ARRAY,
-    POSE_WITH_COVARIANCE_STAMPED, Qos, TF_MESSAGE, WireType,
+    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, OCCUPANCY_GRID_UPDATE, PATH,
+    POSE_ARRAY, POSE_WITH_COVARIANCE_STAMPED, Qos, TF_MESSAGE, WireType,
 };
 use crate::slam::pose::Pose2;
 

@@ -29,7 +29,8 @@ const LONGEST_EXCERPT: usize = 60;
 /// Tiles that are asked for by name at once.
 const MOST_WANTED: usize = 1000;
 
-const WANTED: &str = "none, or at most 1000 tiles as COLUMN:ROW with commas between, as in 0:-1,2:3";
+const WANTED: &str =
+    "none, or at most 1000 tiles as COLUMN:ROW with commas between, as in 0:-1,2:3";
 
 const NANOSECOND_DIGITS: usize = 9;
 
@@ -119,9 +120,7 @@ impl Topic {
     pub fn question(self, parameters: &str) -> Result<Question, SelectorError> {
         let of = |allowed| Parameters::parse(parameters, allowed);
         Ok(match self {
-            Self::Map => {
-                map_question(&of(&["format", "cols", "bbox", "res", "layers"])?)?
-            }
+            Self::Map => map_question(&of(&["format", "cols", "bbox", "res", "layers"])?)?,
             // Never an error: a ROS client of this service would wait for a reply for ever.
             Self::DynamicMap => Question::DynamicMap,
             Self::MapMetadata => Question::MapMetadata(of(&["format"])?.message_format()?),
@@ -458,7 +457,11 @@ fn map_question(parameters: &Parameters<'_>) -> Result<Question, SelectorError> 
     let resolution = parameters.get("res").map(|value| {
         let number = value.parse().ok().filter(|metres: &f64| (1e-6..=1e6).contains(metres));
         let allowed = "metres a cell, as in 0.2";
-        number.ok_or_else(|| SelectorError::NoNumber { name: "res", value: excerpt(value), allowed })
+        number.ok_or_else(|| SelectorError::NoNumber {
+            name: "res",
+            value: excerpt(value),
+            allowed,
+        })
     });
     let (resolution, layers) =
         (resolution.transpose()?, parameters.get("layers").map(layers).transpose()?);
@@ -501,11 +504,8 @@ fn layers(value: &str) -> Result<Vec<Layer>, SelectorError> {
 
 /// Those after a version, or those that are named.
 fn tiles_question(parameters: &Parameters<'_>) -> Result<TilesQuestion, SelectorError> {
-    let number = |name, value, allowed| SelectorError::NoNumber {
-        name,
-        value: excerpt(value),
-        allowed,
-    };
+    let number =
+        |name, value, allowed| SelectorError::NoNumber { name, value: excerpt(value), allowed };
     if let Some(value) = parameters.get("want") {
         if let Some(other) = ["since", "run"].into_iter().find(|n| parameters.get(n).is_some()) {
             return Err(SelectorError::WantBeside(other));

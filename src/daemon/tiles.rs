@@ -149,8 +149,7 @@ impl TileSet {
     fn measure(&mut self) {
         let known = self.tiles.values().filter(|held| held.hash != 0);
         self.head.tiles = known.clone().count() as u32;
-        self.head.extent =
-            known.fold(Extent::default(), |extent, held| extent.union(held.extent));
+        self.head.extent = known.fold(Extent::default(), |extent, held| extent.union(held.extent));
     }
 
     /// What tells which map is the newest.

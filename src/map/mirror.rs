@@ -66,7 +66,8 @@ impl MirroredMap {
             let entry =
                 Entry { index: *index, version: 0, hash: tile.hash, data: tile.data.clone() };
             let read = entry.cells(side).expect("they were read when they came");
-            let first = |tile: i32, start: i32| i64::from(tile) * i64::from(side) - i64::from(start);
+            let first =
+                |tile: i32, start: i32| i64::from(tile) * i64::from(side) - i64::from(start);
             let (left, bottom) = (first(index.tx, extent.ix), first(index.ty, extent.iy));
             for (y, row) in (bottom..).zip(read.chunks_exact(side.into())) {
                 let (from, to) = (left.max(0), (left + i64::from(side)).min(width as i64));
@@ -251,8 +252,11 @@ impl Mirror {
         }
         let nothing = BTreeMap::new();
         let continues = self.held.run() == head.run && self.held.head.side == head.side;
-        let (base, base_head) =
-            if continues { (&self.held.tiles, self.held.head) } else { (&nothing, Head::default()) };
+        let (base, base_head) = if continues {
+            (&self.held.tiles, self.held.head)
+        } else {
+            (&nothing, Head::default())
+        };
         let (mut hash, mut count) = (base_head.hash, i64::from(base_head.tiles));
         for (index, entry) in tiles {
             let before = base.get(index).map_or(0, |tile| tile.hash);

@@ -173,10 +173,8 @@ impl Region {
             let last = first + i64::from(count) * i64::from(self.factor) - 1;
             [first, last].map(|i| i.clamp(i32::MIN.into(), i32::MAX.into()) as i32)
         };
-        let ([left, right], [bottom, top]) = (
-            fine(self.extent.ix, self.extent.width),
-            fine(self.extent.iy, self.extent.height),
-        );
+        let ([left, right], [bottom, top]) =
+            (fine(self.extent.ix, self.extent.width), fine(self.extent.iy, self.extent.height));
         let first = TileKey::containing(Cell::new(left, bottom));
         let last = TileKey::containing(Cell::new(right, top));
         for (key, counts) in map.counts().tiles_between(first, last) {

@@ -15,9 +15,9 @@ use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
 mod rig;
-mod tiles;
 #[path = "../support/mod.rs"]
 mod support;
+mod tiles;
 
 use rig::open;
 use rig::{

@@ -41,13 +41,14 @@ impl World {
 
     fn since(&self, version: u64) -> Vec<Entry> {
         let changed = self.tiles.iter().filter(|(_, (_, of))| *of > version);
-        changed.map(|(index, (value, of))| {
-            let cells = [value.unwrap_or(-1); 16];
-            let hash = value.map_or(0, |_| tile_hash(*index, &cells));
-            let data = value.map_or_else(Bytes::new, |_| compress(&cells));
-            Entry { index: *index, version: *of, hash, data }
-        })
-        .collect()
+        changed
+            .map(|(index, (value, of))| {
+                let cells = [value.unwrap_or(-1); 16];
+                let hash = value.map_or(0, |_| tile_hash(*index, &cells));
+                let data = value.map_or_else(Bytes::new, |_| compress(&cells));
+                Entry { index: *index, version: *of, hash, data }
+            })
+            .collect()
     }
 
     /// One message a tile.
