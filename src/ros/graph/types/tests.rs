@@ -193,7 +193,7 @@ fn hash(name: &str) -> String {
 
 #[test]
 fn hashes_are_those_of_the_definitions() {
-    let types: [WireType; 11] = [
+    let types: [WireType; 12] = [
         DIAGNOSTIC_ARRAY,
         FLOAT64,
         GET_MAP,
