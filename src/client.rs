@@ -68,11 +68,12 @@ pub struct MapMirror {
     _subscribers: [Subscriber<()>; 2],
 }
 
-/// Two kinds of news.
+/// What comes from the daemon.
 #[derive(Debug)]
 enum News {
     Message(Bytes),
-    Alive(bool),
+    Comes,
+    Goes,
 }
 
 impl MapMirror {
@@ -94,7 +95,8 @@ impl MapMirror {
             messages.try_send(News::Message(bytes)).ok();
         };
         let on_life = move |sample: Sample| {
-            sender.try_send(News::Alive(sample.kind() == SampleKind::Put)).ok();
+            let comes = sample.kind() == SampleKind::Put;
+            sender.try_send(if comes { News::Comes } else { News::Goes }).ok();
         };
         let subscriber = session.declare_subscriber(&tiles).callback(on_message).await;
         let subscriber = subscriber.map_err(failed(&tiles))?;
@@ -159,7 +161,8 @@ impl Follower {
             tokio::select! {
                 news = self.news.recv() => match news {
                     Some(News::Message(bytes)) => self.take(&bytes),
-                    Some(News::Alive(is_alive)) => self.live(is_alive),
+                    Some(News::Comes) => self.greet(),
+                    Some(News::Goes) => self.tell(|state| state.is_alive = false),
                     None => return,
                 },
                 reply = answered(&mut self.repair) => {
@@ -179,11 +182,9 @@ impl Follower {
     }
 
     /// Who comes (back) may be another daemon, or have gone on meanwhile.
-    fn live(&mut self, is_alive: bool) {
-        if is_alive {
-            self.ask();
-        }
-        self.tell(|state| state.is_alive = is_alive);
+    fn greet(&mut self) {
+        self.ask();
+        self.tell(|state| state.is_alive = true);
     }
 
     fn take_reply(&mut self, reply: &[Bytes]) {

@@ -514,7 +514,8 @@ fn tiles_question(parameters: &Parameters<'_>) -> Result<TilesQuestion, Selector
         return tile_names(value).map(TilesQuestion::Want).ok_or(error);
     }
     let since = parameters.get("since").map(|value| {
-        value.parse().map_err(|_| number("since", value, "the number of a version, 0 for all"))
+        let version = value.parse().ok();
+        version.ok_or_else(|| number("since", value, "the number of a version, 0 for all"))
     });
     let run = parameters.get("run").map(|value| {
         let hexadecimal = value.len() <= 16 && value.bytes().all(|b| b.is_ascii_hexdigit());
