@@ -15,9 +15,11 @@
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
 //! - [`daemon`]: live mapping on a Zenoh mesh;
+//! - [`client`]: for programs on the mesh that follow robots;
 //! - [`recorded`]: recorded messages in the order in which the daemon takes them;
 //! - [`files`], [`clock`], [`statistics`]: whole files, clocks, percentiles.
 
+pub mod client;
 pub mod clock;
 pub mod config;
 pub mod convert;

@@ -66,7 +66,7 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 18] = [
+const MAY_USE: [(&str, &[&str]); 19] = [
     ("slam", &[]),
     ("sim", &["slam"]),
     ("logs", &["ros", "slam"]),
@@ -105,6 +105,7 @@ const MAY_USE: [(&str, &[&str]); 18] = [
             "timeline",
         ],
     ),
+    ("client", &["daemon", "map"]),
     ("files", &[]),
     ("clock", &[]),
     ("statistics", &[]),

@@ -513,7 +513,8 @@ async fn a_reset_begins_a_new_map_at_the_pose_that_is_given() {
     assert!(moved.between(estimate.pose_in_map).position().norm() < 1e-9);
     let snapshot = rig.end().await;
     assert_eq!(path(&snapshot).iter().map(|(_, pose)| pose).collect::<Vec<_>>(), [place]);
-    assert_eq!(snapshot.map.as_ref().unwrap().version, 2);
+    let map = snapshot.map.as_ref().unwrap();
+    assert_eq!((map.version, map.epoch), (3, 2), "the reset was a version, too");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -88,6 +88,7 @@ async fn a_bridge_is_told_of_topics_and_services() {
 @/<zid>/@ros2_lv/MP/robot01§entropy/std_msgs§msg§Float64/:1:0:0,10:typehash=RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a;
 @/<zid>/@ros2_lv/MP/robot01§map/nav_msgs§msg§OccupancyGrid/:1:1:0,1:typehash=RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7;
 @/<zid>/@ros2_lv/MP/robot01§map_metadata/nav_msgs§msg§MapMetaData/:1:1:0,1:typehash=RIHS01_2772d4b2000ef2b35dbaeb80fd3946c1369f817fb4f75677d916d27c17d763c8;
+@/<zid>/@ros2_lv/MP/robot01§map_updates/map_msgs§msg§OccupancyGridUpdate/:1:0:0,10:typehash=RIHS01_c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8;
 @/<zid>/@ros2_lv/MP/robot01§particlecloud/geometry_msgs§msg§PoseArray/:1:0:0,10:typehash=RIHS01_af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0;
 @/<zid>/@ros2_lv/MP/robot01§path/nav_msgs§msg§Path/:1:1:0,1:typehash=RIHS01_1957a5bb3cee5da65c4e52e52b65a93df227efce4c20f8458b36e73066ca334b;
 @/<zid>/@ros2_lv/MP/robot01§pose/geometry_msgs§msg§PoseWithCovarianceStamped/:1:0:0,10:typehash=RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e;
@@ -122,15 +123,16 @@ async fn nodes_on_rmw_zenoh_are_told_of_a_node_and_its_endpoints() {
 @ros2_lv/5/<zid>/0/10/MP/%/%robot01/gmapd/%robot01%particlecloud/geometry_msgs::msg::dds_::PoseArray_/RIHS01_af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0/1:2:1,10:,:,:,,
 @ros2_lv/5/<zid>/0/11/MP/%/%robot01/gmapd/%robot01%tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087/1:2:1,100:,:,:,,
 @ros2_lv/5/<zid>/0/12/MP/%/%robot01/gmapd/%robot01%diagnostics/diagnostic_msgs::msg::dds_::DiagnosticArray_/RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e/1:2:1,10:,:,:,,
-@ros2_lv/5/<zid>/0/13/SS/%/%robot01/gmapd/%robot01%dynamic_map/nav_msgs::srv::dds_::GetMap_/RIHS01_c8ae77c9995b3554b5ba80e4d4d443f970ac65143102a1d893ec24fc07b31147/1:2:1,10:,:,:,,";
+@ros2_lv/5/<zid>/0/13/MP/%/%robot01/gmapd/%robot01%map_updates/map_msgs::msg::dds_::OccupancyGridUpdate_/RIHS01_c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8/1:2:1,10:,:,:,,
+@ros2_lv/5/<zid>/0/14/SS/%/%robot01/gmapd/%robot01%dynamic_map/nav_msgs::srv::dds_::GetMap_/RIHS01_c8ae77c9995b3554b5ba80e4d4d443f970ac65143102a1d893ec24fc07b31147/1:2:1,10:,:,:,,";
     let settings = ["interop=rmw_zenoh", "ros_domain_id=5"];
     let found = announced("robot01", &settings, "@ros2_lv/**").await;
     assert_eq!(found, lines(expected));
     let settings = ["interop=rmw_zenoh", "ros_distro=humble"];
     let humble = announced("", &settings, "@ros2_lv/**").await;
-    assert_eq!(humble.len(), 14);
+    assert_eq!(humble.len(), 15);
     assert!(humble.contains("@ros2_lv/0/<zid>/0/0/NN/%/%/gmapd"), "{humble:?}");
-    assert_eq!(humble.iter().filter(|token| token.contains("/TypeHashNotSupported/")).count(), 13);
+    assert_eq!(humble.iter().filter(|token| token.contains("/TypeHashNotSupported/")).count(), 14);
 }
 
 #[tokio::test(flavor = "multi_thread")]

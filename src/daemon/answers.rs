@@ -14,9 +14,12 @@ use zenoh::bytes::Encoding;
 use super::command::{Command, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
 use super::save::{SaveError, SaveName, Saver};
-use super::selector::{MapFormat, MessageFormat, PathFormat, Question, SelectorError};
+use super::selector::{
+    MapFormat, MessageFormat, PathFormat, Question, RegionForm, RegionQuestion, SelectorError,
+};
 use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
+use super::tiles::{TileSet, TileStore};
 use crate::convert;
 use crate::ros;
 use crate::slam::path::Path;
@@ -30,7 +33,8 @@ const LONGEST_COMMAND: Duration = Duration::from_secs(5);
 /// What a reply carries.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Answer {
-    pub(super) payload: Bytes,
+    /// One after the other; mostly there is one.
+    pub(super) payloads: Vec<Bytes>,
     pub(super) encoding: Encoding,
     pub(super) attachment: Option<Bytes>,
 }
@@ -81,6 +85,7 @@ pub(super) struct Responder {
     status: AskStatus,
     commands: mpsc::Sender<Request>,
     products: Arc<ProductCache>,
+    tiles: Arc<TileStore>,
     saver: Saver,
     map_frame: String,
 }
@@ -88,12 +93,15 @@ pub(super) struct Responder {
 impl Responder {
     pub(super) fn new(
         settings: &Settings,
+        run: u64,
         snapshots: watch::Receiver<Arc<Snapshot>>,
         status: AskStatus,
         commands: mpsc::Sender<Request>,
     ) -> Self {
+        let tiles = TileSet::new(run, settings.resolution);
         let empty = EmptyMap { frame: settings.map_frame.clone(), resolution: settings.resolution };
         Self {
+            tiles: Arc::new(TileStore::new(tiles, snapshots.clone())),
             snapshots,
             status,
             commands,
@@ -108,6 +116,11 @@ impl Responder {
         self.products.clone()
     }
 
+    /// The tiles, for those who publish them.
+    pub(super) fn tiles(&self) -> Arc<TileStore> {
+        self.tiles.clone()
+    }
+
     /// Answers; blocks while something is encoded, written, or done by the filter.
     pub(super) fn answer(&self, question: &Question) -> Result<Answer, Refusal> {
         let snapshot = self.snapshots.borrow().clone();
@@ -115,10 +128,11 @@ impl Responder {
             Question::Map(format) => self.map(&snapshot, *format),
             Question::DynamicMap => {
                 self.products.note_asked();
-                let payload = self.products_of(&snapshot).cdr();
+                let payloads = vec![self.products_of(&snapshot).cdr()];
                 let encoding = cdr_of::<ros::GetMapResponse>();
-                Ok(Answer { payload, encoding, attachment: None })
+                Ok(Answer { payloads, encoding, attachment: None })
             }
+            Question::Region(question) => self.region(&snapshot, question),
             Question::MapMetadata(format) => {
                 let products = self.products_of(&snapshot);
                 let attachment = Some(products.attachment());
@@ -126,7 +140,7 @@ impl Responder {
             }
             Question::Pose { at, format } => Ok(message(&self.pose(&snapshot, *at)?, *format)),
             Question::Path(format) => Ok(Answer {
-                payload: self.products_of(&snapshot).path_in(*format),
+                payloads: vec![self.products_of(&snapshot).path_in(*format)],
                 encoding: path_encoding(*format),
                 attachment: None,
             }),
@@ -137,6 +151,11 @@ impl Responder {
                 let report = snapshot.estimate.report.as_ref().ok_or(Refusal::NoEntropy)?;
                 Ok(message(&ros::Float64 { data: report.entropy }, *format))
             }
+            Question::Tiles(question) => Ok(Answer {
+                payloads: self.tiles.newest(|tiles| tiles.answer(question)),
+                encoding: Encoding::APPLICATION_OCTET_STREAM,
+                attachment: None,
+            }),
             Question::Status => Ok(json(&self.status.status())),
             Question::Reset(pose) => self.command(Command::Reset(*pose)),
             Question::Pause => self.command(Command::Pause),
@@ -154,10 +173,25 @@ impl Responder {
         self.products.note_asked();
         let products = self.products_of(snapshot);
         Ok(Answer {
-            payload: products.map(format, snapshot.estimate.pose_in_map)?,
+            payloads: vec![products.map(format, snapshot.estimate.pose_in_map)?],
             encoding: map_encoding(format),
             attachment: Some(products.attachment()),
         })
+    }
+
+    fn region(&self, snapshot: &Snapshot, question: &RegionQuestion) -> Result<Answer, Refusal> {
+        let products = self.products_of(snapshot);
+        let (payload, encoding) = match &question.form {
+            RegionForm::Layers(layers) => {
+                (products.layers(question, layers)?, Encoding::APPLICATION_JSON)
+            }
+            RegionForm::Map(format) => {
+                let region = products.region(question)?;
+                let robot_in_map = snapshot.estimate.pose_in_map;
+                (region.map(*format, robot_in_map)?, map_encoding(*format))
+            }
+        };
+        Ok(Answer { payloads: vec![payload], encoding, attachment: Some(products.attachment()) })
     }
 
     fn pose(
@@ -247,12 +281,12 @@ fn message<M: ros::Message>(message: &M, format: MessageFormat) -> Answer {
             (ros::json(message), Encoding::APPLICATION_JSON.with_schema(M::TYPE))
         }
     };
-    Answer { payload: payload.into(), encoding, attachment: None }
+    Answer { payloads: vec![payload.into()], encoding, attachment: None }
 }
 
 fn json(value: &impl Serialize) -> Answer {
     let bytes = serde_json::to_vec(value).expect("memory takes it, and every key is a string");
-    Answer { payload: bytes.into(), encoding: Encoding::APPLICATION_JSON, attachment: None }
+    Answer { payloads: vec![bytes.into()], encoding: Encoding::APPLICATION_JSON, attachment: None }
 }
 
 fn map_encoding(format: MapFormat) -> Encoding {

@@ -8,13 +8,14 @@ use bytes::Bytes;
 use serde::Serialize;
 use thiserror::Error;
 
-use super::selector::{MapFormat, MessageFormat, PathFormat};
+use super::selector::{MapFormat, MessageFormat, PathFormat, RegionQuestion};
 use super::snapshot::MapVersion;
 use crate::convert;
 use crate::evaluation::{self, StampedPose};
 use crate::map;
+use crate::map::region::{Layer, Region, RegionError, Window};
 use crate::ros;
-use crate::slam::grid::occupancy::OccupancyGrid;
+use crate::slam::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use crate::slam::path::Path;
 use crate::slam::pose::{Point2, Pose2, Stamp};
 
@@ -42,7 +43,7 @@ pub struct Label {
 }
 
 /// Why a format cannot be had.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[derive(Debug, Clone, PartialEq, Error)]
 pub enum FormatError {
     /// There is nothing to see.
     #[error(
@@ -53,6 +54,9 @@ pub enum FormatError {
     /// The map has a size that pictures do not have.
     #[error("the map cannot be drawn: {0}")]
     Picture(String),
+    /// No such region.
+    #[error(transparent)]
+    Region(#[from] RegionError),
 }
 
 /// One version of the map, or the empty one, as bytes.
@@ -174,6 +178,42 @@ impl MapProducts {
         self.png.get_or_init(encode).clone()
     }
 
+    /// A part of the map in coarser cells, as a map that can be had in all formats.
+    ///
+    /// # Errors
+    /// When its cells would be too fine or too many.
+    pub fn region(&self, asked: &RegionQuestion) -> Result<Self, FormatError> {
+        let region = self.cells_of(asked)?;
+        let (map, threshold) = self.counted();
+        let grid = region.occupancy(map, threshold);
+        let part = Self::new(self.version.clone(), self.empty.clone());
+        Ok(Self { grid: OnceLock::from(grid), ..part })
+    }
+
+    /// Layers of a part of the map, as JSON.
+    ///
+    /// # Errors
+    /// When its cells would be too fine or too many.
+    pub fn layers(&self, asked: &RegionQuestion, layers: &[Layer]) -> Result<Bytes, FormatError> {
+        let (map, threshold) = self.counted();
+        Ok(self.cells_of(asked)?.json(layers, map, threshold).into())
+    }
+
+    fn counted(&self) -> (Option<&OccupancyMap>, f64) {
+        let version = self.version.as_ref();
+        version.map_or((None, 0.0), |map| (Some(&map.occupancy), map.occupied_threshold))
+    }
+
+    fn cells_of(&self, asked: &RegionQuestion) -> Result<Region, FormatError> {
+        let resolution = self.counted().0.map_or(self.empty.resolution, OccupancyMap::resolution);
+        let window = asked.window.unwrap_or_else(|| {
+            let OccupancyGrid { resolution, width, height, origin, .. } = self.grid();
+            let [x, y] = [*width, *height].map(|cells| cells as f64 * resolution);
+            Window { low: *origin, high: Point2::new(origin.x + x, origin.y + y) }
+        });
+        Ok(Region::new(window, asked.resolution.unwrap_or(resolution), resolution)?)
+    }
+
     /// The image of map_server.
     #[must_use]
     pub fn pgm(&self) -> Bytes {
@@ -283,7 +323,7 @@ impl ProductCache {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::grid::occupancy::{BeamEnd, BeamEndKind, OccupancyMap, ScanOutline};
+    use crate::slam::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
 
     fn empty() -> EmptyMap {
         EmptyMap { frame: "map".to_owned(), resolution: 0.05 }
@@ -299,6 +339,7 @@ mod tests {
         let path = [(Stamp(1_000_000_000), Pose2::IDENTITY)];
         Arc::new(MapVersion {
             version: number,
+            epoch: 1,
             stamp: Stamp(2_500_000_000),
             occupancy,
             occupied_threshold: 0.25,

@@ -100,6 +100,8 @@ struct View {
     estimate: Estimate,
     map: Option<Arc<MapVersion>>,
     version: u64,
+    /// The epoch in which the filter began.
+    first_epoch: u64,
     /// The last scan in the map, if that is newer than the last version.
     unpublished: Option<Stamp>,
     /// The last processed scan.
@@ -129,6 +131,7 @@ impl View {
             estimate,
             map: None,
             version: 0,
+            first_epoch: 1,
             unpublished: None,
             processed: None,
             odom_from_base: None,
@@ -347,11 +350,16 @@ impl Mapper {
         self.view.changed = true;
         self.view.map = Some(Arc::new(MapVersion {
             version: self.view.version,
+            epoch: self.epoch(),
             stamp,
             occupancy: self.engine.occupancy().clone(),
             occupied_threshold: self.engine.occupied_threshold(),
             path: self.engine.path(),
         }));
+    }
+
+    fn epoch(&self) -> u64 {
+        self.view.first_epoch + self.engine.map_corrections()
     }
 
     fn refuse(&mut self, refusal: Refusal) {
@@ -395,11 +403,14 @@ impl Mapper {
     }
 
     fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
+        let epoch = self.epoch() + 1;
         self.engine.reset(pose_in_map.or(self.initial_pose));
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
         self.view.paused = before.paused;
-        self.view.version = before.version;
+        // To have no map is a version, too.
+        self.view.version = before.version + 1;
+        self.view.first_epoch = epoch;
         self.gauges.matched.clear();
         self.renew_estimate(None);
         let at = match pose_in_map.or(self.initial_pose) {

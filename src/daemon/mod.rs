@@ -15,6 +15,7 @@ mod judgement;
 pub mod keys;
 pub mod ledger;
 pub mod mailbox;
+mod map_updates;
 pub mod mapper;
 mod message_clock;
 mod outputs;
@@ -27,6 +28,7 @@ pub mod serving;
 pub mod snapshot;
 pub mod status;
 pub mod synchronizer;
+pub mod tiles;
 
 use std::future::Future;
 use std::path::PathBuf;

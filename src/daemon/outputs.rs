@@ -23,17 +23,20 @@ use super::answers::{particle_cloud, pose_message};
 use super::diagnostics::diagnostics;
 use super::formats::{MapProducts, ProductCache};
 use super::ledger::Entry;
+use super::map_updates::UpdatesOutput;
 use super::message_clock::MessageClock;
 use super::ros_node::{Output, RosNode, Signature};
-use super::selector::{MessageFormat, PathFormat};
+use super::selector::{MessageFormat, PathFormat, Topic};
 use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
+use super::tiles::TileStore;
+use super::tiles::publishing::TilesOutput;
 use crate::clock::Stopwatch;
 use crate::convert;
 use crate::ros;
 use crate::ros::graph::{
-    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, PATH, POSE_ARRAY,
-    POSE_WITH_COVARIANCE_STAMPED, Qos, TF_MESSAGE, WireType,
+    DIAGNOSTIC_ARRAY, FLOAT64, MAP_META_DATA, OCCUPANCY_GRID, OCCUPANCY_GRID_UPDATE, PATH,
+    POSE_ARRAY, POSE_WITH_COVARIANCE_STAMPED, Qos, TF_MESSAGE, WireType,
 };
 use crate::slam::pose::Pose2;
 
@@ -75,6 +78,58 @@ impl Declare<'_> {
             };
             tasks.spawn(output.run(snapshots.clone()));
         }
+        Ok(())
+    }
+
+    /// `slam/tiles`.
+    pub(super) async fn tiles(
+        &self,
+        settings: &Settings,
+        snapshots: &Snapshots,
+        tiles: Arc<TileStore>,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let key = self.node.prefix().key(Topic::Tiles.name())?;
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .encoding(Encoding::APPLICATION_OCTET_STREAM)
+            // What is dropped is asked for by those who miss it.
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::DataLow)
+            .await;
+        let publisher = Arc::new(declared(key, publisher)?);
+        let output = TilesOutput { publisher, tiles, interval: settings.map_update_interval };
+        tasks.spawn(output.run(snapshots.clone()));
+        Ok(())
+    }
+
+    /// `map_updates`.
+    pub(super) async fn map_updates(
+        &mut self,
+        settings: &Settings,
+        snapshots: &Snapshots,
+        products: Arc<ProductCache>,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ServingError> {
+        let output = self.node.output("map_updates", OCCUPANCY_GRID_UPDATE, Qos::reliable(10))?;
+        let Output { key, encoding, signature } = output;
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .encoding(encoding)
+            // As the map, and in one queue with it: a rectangle goes with the map before it.
+            .congestion_control(CongestionControl::BlockFirst)
+            .priority(Retained::Map.priority())
+            .await;
+        let output = UpdatesOutput {
+            publisher: Arc::new(declared(key, publisher)?),
+            signature,
+            products,
+            map_frame: settings.map_frame.clone(),
+            interval: settings.map_update_interval,
+        };
+        tasks.spawn(output.run(snapshots.clone()));
         Ok(())
     }
 

@@ -194,10 +194,10 @@ fn answer(responder: &Responder, topic: Topic, query: &Query) -> Result<Answer, 
 /// Blocks until the transport has taken the reply.
 fn reply(query: &Query, key: &OwnedKeyExpr, answer: Result<Answer, Refusal>) {
     let sent = match answer {
-        Ok(answer) => {
-            let reply = query.reply(key, answer.payload).encoding(answer.encoding);
-            reply.attachment(answer.attachment).wait()
-        }
+        Ok(answer) => answer.payloads.into_iter().try_for_each(|payload| {
+            let reply = query.reply(key, payload).encoding(answer.encoding.clone());
+            reply.attachment(answer.attachment.clone()).wait()
+        }),
         Err(refusal) => query.reply_err(refusal.to_string()).encoding(Encoding::TEXT_PLAIN).wait(),
     };
     match sent {

@@ -9,7 +9,10 @@ use std::num::NonZeroUsize;
 use thiserror::Error;
 
 use super::save::{NameError, SaveName};
-use crate::slam::pose::{Pose2, Stamp, wrap_angle};
+use super::tiles::TilesQuestion;
+use crate::map::region::{Layer, Window};
+use crate::map::tiles::TileIndex;
+use crate::slam::pose::{Point2, Pose2, Stamp, wrap_angle};
 
 /// Columns of a map drawn with characters, unless asked otherwise.
 const USUAL_COLUMNS: NonZeroUsize = NonZeroUsize::new(80).expect("80 is not 0");
@@ -22,6 +25,12 @@ const FURTHEST: f64 = 1e6;
 
 /// Characters of a query that an error repeats.
 const LONGEST_EXCERPT: usize = 60;
+
+/// Tiles that are asked for by name at once.
+const MOST_WANTED: usize = 1000;
+
+const WANTED: &str =
+    "none, or at most 1000 tiles as COLUMN:ROW with commas between, as in 0:-1,2:3";
 
 const NANOSECOND_DIGITS: usize = 9;
 
@@ -42,6 +51,8 @@ pub enum Topic {
     ParticleCloud,
     /// How undecided the particles are.
     Entropy,
+    /// The map as tiles.
+    Tiles,
     /// How the daemon is.
     Status,
     /// Begin anew.
@@ -58,7 +69,7 @@ pub enum Topic {
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -66,6 +77,7 @@ impl Topic {
         Self::Path,
         Self::ParticleCloud,
         Self::Entropy,
+        Self::Tiles,
         Self::Status,
         Self::Reset,
         Self::Pause,
@@ -85,6 +97,7 @@ impl Topic {
             Self::Path => "path",
             Self::ParticleCloud => "particlecloud",
             Self::Entropy => "entropy",
+            Self::Tiles => "slam/tiles",
             Self::Status => "slam/status",
             Self::Reset => "slam/cmd/reset",
             Self::Pause => "slam/cmd/pause",
@@ -103,7 +116,7 @@ impl Topic {
     /// Whether the answer may be megabytes, which take their time on the network.
     #[must_use]
     pub const fn is_large(self) -> bool {
-        matches!(self, Self::Map | Self::DynamicMap | Self::Path)
+        matches!(self, Self::Map | Self::DynamicMap | Self::Path | Self::Tiles)
     }
 
     /// What is asked with these parameters.
@@ -113,7 +126,7 @@ impl Topic {
     pub fn question(self, parameters: &str) -> Result<Question, SelectorError> {
         let of = |allowed| Parameters::parse(parameters, allowed);
         Ok(match self {
-            Self::Map => Question::Map(map_format(&of(&["format", "cols"])?)?),
+            Self::Map => map_question(&of(&["format", "cols", "bbox", "res", "layers"])?)?,
             // Never an error: a ROS client of this service would wait for a reply for ever.
             Self::DynamicMap => Question::DynamicMap,
             Self::MapMetadata => Question::MapMetadata(of(&["format"])?.message_format()?),
@@ -125,6 +138,7 @@ impl Topic {
             Self::Path => Question::Path(path_format(&of(&["format"])?)?),
             Self::ParticleCloud => Question::ParticleCloud(of(&["format"])?.message_format()?),
             Self::Entropy => Question::Entropy(of(&["format"])?.message_format()?),
+            Self::Tiles => Question::Tiles(tiles_question(&of(&["since", "run", "want"])?)?),
             Self::Status => {
                 of(&["format"])?.choice("format", &[("json", ())])?;
                 Question::Status
@@ -150,6 +164,8 @@ impl Topic {
 pub enum Question {
     /// The map, in this format.
     Map(MapFormat),
+    /// A part of it, or the whole in coarser cells.
+    Region(RegionQuestion),
     /// The map as the response of `nav_msgs/srv/GetMap`.
     DynamicMap,
     /// `nav_msgs/MapMetaData`.
@@ -167,6 +183,8 @@ pub enum Question {
     ParticleCloud(MessageFormat),
     /// `std_msgs/Float64`.
     Entropy(MessageFormat),
+    /// The map as tiles.
+    Tiles(TilesQuestion),
     /// How the daemon is.
     Status,
     /// Begin anew, with the base at this pose in `map` if there is one.
@@ -179,6 +197,26 @@ pub enum Question {
     InitialPose(Pose2),
     /// Write the map to files of this name.
     Save(SaveName),
+}
+
+/// Which part of the map is asked for, and what of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RegionQuestion {
+    /// The part; `None` for the whole.
+    pub window: Option<Window>,
+    /// Metres a cell at least; `None` for the map's own.
+    pub resolution: Option<f64>,
+    /// What to tell of each cell, and how to write it.
+    pub form: RegionForm,
+}
+
+/// The ways to write a region.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum RegionForm {
+    /// As a map.
+    Map(MapFormat),
+    /// These layers, as JSON.
+    Layers(Vec<Layer>),
 }
 
 /// The ways to write the map.
@@ -256,6 +294,23 @@ pub enum SelectorError {
     /// A width for a format that has none.
     #[error("cols is only for format=text; leave it out, or ask for format=text")]
     ColumnsWithoutText,
+    /// A region without any area.
+    #[error(
+        "bbox={0:?} is inverted or empty; it must be x0,y0,x1,y1 with x0 below x1 and y0 below y1"
+    )]
+    NoArea(String),
+    /// A layer that is not known.
+    #[error(
+        "there is no layer {0:?}; allowed are occupancy, hits, visits, with commas between, each \
+         once (when a cell was seen last is not kept)"
+    )]
+    NoLayer(String),
+    /// Layers that a format cannot show.
+    #[error("format goes with layers=occupancy alone; other layers are always JSON")]
+    LayersAsMap,
+    /// Tiles by version and by place at once.
+    #[error("{0} does not go with want: tiles are asked for by version or by name")]
+    WantBeside(&'static str),
     /// A pose without some of its parts.
     #[error("{0} is missing: a pose needs x and y in metres and yaw in radians")]
     PartOfPose(&'static str),
@@ -402,6 +457,91 @@ fn columns(value: &str) -> Result<NonZeroUsize, SelectorError> {
     })
 }
 
+fn map_question(parameters: &Parameters<'_>) -> Result<Question, SelectorError> {
+    let format = map_format(parameters)?;
+    let window = parameters.get("bbox").map(window).transpose()?;
+    let resolution = parameters.get("res").map(|value| {
+        let number = value.parse().ok().filter(|metres: &f64| (1e-6..=1e6).contains(metres));
+        let allowed = "metres a cell, as in 0.2";
+        number.ok_or_else(|| SelectorError::NoNumber {
+            name: "res",
+            value: excerpt(value),
+            allowed,
+        })
+    });
+    let (resolution, layers) =
+        (resolution.transpose()?, parameters.get("layers").map(layers).transpose()?);
+    let form = match layers {
+        Some(layers) if layers != [Layer::Occupancy] => {
+            if parameters.get("format").is_some_and(|format| format != "json") {
+                return Err(SelectorError::LayersAsMap);
+            }
+            RegionForm::Layers(layers)
+        }
+        None if window.is_none() && resolution.is_none() => return Ok(Question::Map(format)),
+        _ => RegionForm::Map(format),
+    };
+    Ok(Question::Region(RegionQuestion { window, resolution, form }))
+}
+
+fn window(value: &str) -> Result<Window, SelectorError> {
+    let corners: Option<Vec<f64>> = value.split(',').map(|number| number.parse().ok()).collect();
+    let corners = corners.filter(|all| all.iter().all(|metres| metres.abs() <= FURTHEST));
+    let Some([x0, y0, x1, y1]) = corners.and_then(|all| <[f64; 4]>::try_from(all).ok()) else {
+        let allowed = "x0,y0,x1,y1 in metres from -1000000 to 1000000";
+        return Err(SelectorError::NoNumber { name: "bbox", value: excerpt(value), allowed });
+    };
+    if x0 >= x1 || y0 >= y1 {
+        return Err(SelectorError::NoArea(excerpt(value)));
+    }
+    Ok(Window { low: Point2::new(x0, y0), high: Point2::new(x1, y1) })
+}
+
+fn layers(value: &str) -> Result<Vec<Layer>, SelectorError> {
+    let mut found = Vec::new();
+    for name in value.split(',') {
+        let known = [Layer::Occupancy, Layer::Hits, Layer::Visits];
+        let layer = known.into_iter().find(|layer| layer.name() == name);
+        let layer = layer.filter(|layer| !found.contains(layer));
+        found.push(layer.ok_or_else(|| SelectorError::NoLayer(excerpt(name)))?);
+    }
+    Ok(found)
+}
+
+/// Those after a version, or those that are named.
+fn tiles_question(parameters: &Parameters<'_>) -> Result<TilesQuestion, SelectorError> {
+    let number =
+        |name, value, allowed| SelectorError::NoNumber { name, value: excerpt(value), allowed };
+    if let Some(value) = parameters.get("want") {
+        if let Some(other) = ["since", "run"].into_iter().find(|n| parameters.get(n).is_some()) {
+            return Err(SelectorError::WantBeside(other));
+        }
+        let error = number("want", value, WANTED);
+        return tile_names(value).map(TilesQuestion::Want).ok_or(error);
+    }
+    let since = parameters.get("since").map(|value| {
+        let version = value.parse().ok();
+        version.ok_or_else(|| number("since", value, "the number of a version, 0 for all"))
+    });
+    let run = parameters.get("run").map(|value| {
+        let hexadecimal = value.len() <= 16 && value.bytes().all(|b| b.is_ascii_hexdigit());
+        let run = u64::from_str_radix(value, 16).ok().filter(|_| hexadecimal);
+        run.ok_or_else(|| number("run", value, "at most 16 hexadecimal digits"))
+    });
+    Ok(TilesQuestion::Since { version: since.transpose()?.unwrap_or(0), run: run.transpose()? })
+}
+
+fn tile_names(value: &str) -> Option<Vec<TileIndex>> {
+    if value == "none" {
+        return Some(Vec::new());
+    }
+    let named = value.split(',').map(|name| {
+        let (tx, ty) = name.split_once(':')?;
+        Some(TileIndex { ty: ty.parse().ok()?, tx: tx.parse().ok()? })
+    });
+    named.collect::<Option<Vec<_>>>().filter(|named| named.len() <= MOST_WANTED)
+}
+
 fn path_format(parameters: &Parameters<'_>) -> Result<PathFormat, SelectorError> {
     let choices = [
         ("json", PathFormat::Message(MessageFormat::Json)),
@@ -441,6 +581,8 @@ mod tests {
         assert_eq!(asked(Topic::Path), Ok(Question::Path(PathFormat::Message(json))));
         assert_eq!(asked(Topic::ParticleCloud), Ok(Question::ParticleCloud(json)));
         assert_eq!(asked(Topic::Entropy), Ok(Question::Entropy(json)));
+        let all = TilesQuestion::Since { version: 0, run: None };
+        assert_eq!(asked(Topic::Tiles), Ok(Question::Tiles(all)));
         assert_eq!(asked(Topic::Status), Ok(Question::Status));
         assert_eq!(asked(Topic::Reset), Ok(Question::Reset(None)));
         assert_eq!(asked(Topic::Pause), Ok(Question::Pause));
@@ -480,7 +622,7 @@ mod tests {
     fn errors_name_the_part_and_list_what_is_allowed() {
         assert_eq!(
             error(Topic::Map, "fromat=png"),
-            "there is no parameter \"fromat\" here; allowed are format, cols"
+            "there is no parameter \"fromat\" here; allowed are format, cols, bbox, res, layers"
         );
         assert_eq!(
             error(Topic::Map, "format=pgn"),
@@ -518,6 +660,74 @@ mod tests {
             error(Topic::InitialPose, "x=1;y=2;yaw=90"),
             "yaw=\"90\" is not allowed; it must be a number of radians from -6.283 to 6.283"
         );
+    }
+
+    #[test]
+    fn a_region_has_corners_cells_and_layers() {
+        let asked = |parameters: &str| match Topic::Map.question(parameters) {
+            Ok(Question::Region(question)) => Ok(question),
+            Ok(other) => panic!("{other:?}"),
+            Err(error) => Err(error.to_string()),
+        };
+        let window = Window { low: Point2::new(-1.0, 0.5), high: Point2::new(2.0, 3e1) };
+        let map = |format| RegionForm::Map(format);
+        let region = |window, resolution, form| Ok(RegionQuestion { window, resolution, form });
+        let box_only = region(Some(window), None, map(MapFormat::Cdr));
+        assert_eq!(asked("bbox=-1,0.5,2,3e1"), box_only);
+        assert_eq!(asked("bbox=-1,0.5,2,30;layers=occupancy"), box_only);
+        assert_eq!(asked("res=0.2;format=png"), region(None, Some(0.2), map(MapFormat::Png)));
+        let layers = RegionForm::Layers(vec![Layer::Hits, Layer::Occupancy]);
+        assert_eq!(asked("layers=hits,occupancy"), region(None, None, layers.clone()));
+        assert_eq!(asked("format=json;layers=hits,occupancy"), region(None, None, layers));
+        for (parameters, begins) in [
+            ("bbox=1,0,0,1", "bbox=\"1,0,0,1\" is inverted or empty"),
+            ("bbox=0,0,0,1", "bbox=\"0,0,0,1\" is inverted or empty"),
+            ("bbox=0,0,1", "bbox=\"0,0,1\" is not allowed; it must be x0,y0,x1,y1"),
+            ("bbox=0,0,1,nan", "bbox=\"0,0,1,nan\" is not allowed"),
+            ("bbox=0,0,1e7,1", "bbox=\"0,0,1e7,1\" is not allowed"),
+            ("res=0", "res=\"0\" is not allowed; it must be metres a cell"),
+            ("res=-1", "res=\"-1\" is not allowed"),
+            ("layers=last_seen", "there is no layer \"last_seen\"; allowed are occupancy, hits"),
+            ("layers=hits,hits", "there is no layer \"hits\"; allowed are occupancy, hits, visits"),
+            ("layers=", "there is no layer \"\""),
+            ("layers=hits;format=png", "format goes with layers=occupancy alone"),
+        ] {
+            let error = asked(parameters).unwrap_err();
+            assert!(error.starts_with(begins), "{parameters}: {error}");
+        }
+    }
+
+    #[test]
+    fn tiles_are_asked_for_by_version_or_by_name() {
+        let asked = |parameters: &str| match Topic::Tiles.question(parameters) {
+            Ok(Question::Tiles(question)) => Ok(question),
+            Ok(other) => panic!("{other:?}"),
+            Err(error) => Err(error.to_string()),
+        };
+        let since = |version, run| Ok(TilesQuestion::Since { version, run });
+        assert_eq!(asked("since=12"), since(12, None));
+        assert_eq!(asked("since=12;run=00ff"), since(12, Some(255)));
+        assert_eq!(asked("want=none"), Ok(TilesQuestion::Want(Vec::new())));
+        let named = vec![TileIndex { ty: -1, tx: 0 }, TileIndex { ty: 3, tx: 2 }];
+        assert_eq!(asked("want=0:-1,2:3"), Ok(TilesQuestion::Want(named)));
+        assert_eq!(
+            asked("want=none;since=3").unwrap_err(),
+            "since does not go with want: tiles are asked for by version or by name"
+        );
+        assert_eq!(
+            asked("since=-1").unwrap_err(),
+            "since=\"-1\" is not allowed; it must be the number of a version, 0 for all"
+        );
+        assert_eq!(
+            asked("want=1").unwrap_err(),
+            "want=\"1\" is not allowed; it must be none, or at most 1000 tiles as COLUMN:ROW \
+             with commas between, as in 0:-1,2:3"
+        );
+        for nonsense in ["run=xyz", "run=+1", "run=", "run=00000000000000001", "want=", "want=1:2,"]
+        {
+            assert!(asked(nonsense).is_err(), "{nonsense}");
+        }
+        assert!(asked(&format!("want={}", "1:1,".repeat(1001).trim_end_matches(','))).is_err());
     }
 
     #[test]

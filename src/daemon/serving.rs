@@ -22,6 +22,8 @@ use super::queries::Queryables;
 use super::ros_node::RosNode;
 use super::snapshot::Snapshot;
 use super::status::Status;
+use super::tiles::run_number;
+use crate::clock;
 use crate::config::Config;
 
 /// The key under the prefix of the token that lives as long as the daemon answers.
@@ -147,15 +149,19 @@ impl Serving {
         sources: Sources,
     ) -> Result<Self, ServingError> {
         let Sources { snapshots, verdicts, commands, status } = sources;
+        let run = run_number(&session.zid().to_string(), clock::unix_nanoseconds());
         let responder =
-            Arc::new(Responder::new(&settings, snapshots.clone(), status.clone(), commands));
+            Arc::new(Responder::new(&settings, run, snapshots.clone(), status.clone(), commands));
         let mut declare = outputs::Declare { session, node: &mut node };
         let mut tasks = JoinSet::new();
         declare.maps(&settings, &snapshots, &responder.products(), &mut tasks).await?;
+        declare.tiles(&settings, &snapshots, responder.tiles(), &mut tasks).await?;
         declare.estimates(&settings, &snapshots, &mut tasks).await?;
         tasks.spawn(keep_ready(responder.products(), snapshots.clone()));
-        declare.transform(settings, snapshots, &mut tasks).await?;
+        declare.transform(settings.clone(), snapshots.clone(), &mut tasks).await?;
         declare.diagnostics(status, &mut tasks).await?;
+        let products = responder.products();
+        declare.map_updates(&settings, &snapshots, products, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
         let queryables = Queryables::declare(session, &mut node, responder).await?;
         let announced = node.announce(session).await?;

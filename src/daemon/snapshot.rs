@@ -49,8 +49,10 @@ pub struct Estimate {
 /// One version of the map. A copy costs little: tiles and poses are shared.
 #[derive(Debug)]
 pub struct MapVersion {
-    /// From 1; grows with every change, over resets too.
+    /// From 1; grows with every change, and with every reset by one more.
     pub version: u64,
+    /// Grows when scans that were in the last version lie elsewhere, or are forgotten.
+    pub epoch: u64,
     /// Of the last scan in it.
     pub stamp: Stamp,
     /// Hits and visits of each cell.

@@ -4,9 +4,12 @@
 mod bounds;
 mod hash;
 mod json;
+pub mod mirror;
 mod pgm;
 mod picture;
+pub mod region;
 mod text;
+pub mod tiles;
 
 pub use hash::content_hash;
 pub use json::{NotAMap, json, parse_json};

@@ -11,6 +11,7 @@ mod field_path;
 mod fields;
 mod geometry_msgs;
 pub mod graph;
+mod map_msgs;
 mod nav_msgs;
 mod sensor_msgs;
 mod std_msgs;
@@ -26,6 +27,7 @@ pub use geometry_msgs::{
     Point, Pose, PoseArray, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, Quaternion,
     Transform, TransformStamped, Twist, TwistWithCovariance, Vector3,
 };
+pub use map_msgs::OccupancyGridUpdate;
 pub use nav_msgs::{GetMapRequest, GetMapResponse, MapMetaData, OccupancyGrid, Odometry, Path};
 pub use sensor_msgs::LaserScan;
 pub use std_msgs::{Float64, Header, Time};

@@ -7,7 +7,7 @@ use proptest::prelude::{Just, Strategy, any, prop_assert, prop_assert_eq, prop_o
 use super::{
     Covariance, DecodeError, DiagnosticArray, DiagnosticStatus, Float64, GetMapRequest,
     GetMapResponse, Header, Int8Array, KeyValue, LaserScan, MapMetaData, Message, OccupancyGrid,
-    Odometry, Path, Point, Pose, PoseArray, PoseStamped, PoseWithCovariance,
+    OccupancyGridUpdate, Odometry, Path, Point, Pose, PoseArray, PoseStamped, PoseWithCovariance,
     PoseWithCovarianceStamped, Quaternion, TfMessage, Time, Transform, TransformStamped, Twist,
     TwistWithCovariance, Vector3, cdr, decode, json,
 };
@@ -163,6 +163,14 @@ fn every_message_has_the_bytes_of_rosbags() {
     agrees(&tf_message());
     agrees(&occupancy_grid());
     agrees(&occupancy_grid().info);
+    agrees(&OccupancyGridUpdate {
+        header: header(3, 4, "map"),
+        x: 1,
+        y: -2,
+        width: 2,
+        height: 3,
+        data: occupancy_grid().data,
+    });
     agrees(&PoseStamped { header: header(3, 4, "map"), pose: first_pose() });
     agrees(&pose_with_covariance_stamped());
     agrees(&PoseArray { header: header(3, 4, "map"), poses: vec![first_pose(), second_pose()] });

@@ -155,6 +155,14 @@ impl Engine {
         }
     }
 
+    /// How often the map became another one since the first scan, not only a larger one.
+    #[must_use]
+    pub const fn map_corrections(&self) -> u64 {
+        match self {
+            Self::GMapping(filter) => filter.map_corrections(),
+        }
+    }
+
     /// The map, cropped to what is known; `None` before the first scan.
     #[must_use]
     pub fn occupancy_grid(&mut self) -> Option<OccupancyGrid> {

@@ -17,6 +17,7 @@ use zenoh::sample::{Sample, SampleKind};
 mod rig;
 #[path = "../support/mod.rs"]
 mod support;
+mod tiles;
 
 use rig::open;
 use rig::{
@@ -418,6 +419,7 @@ async fn a_map_that_did_not_change_is_not_published_again() {
     let (later, known) = (version(&drive[4]), version(first));
     let same = MapVersion {
         version: later.version,
+        epoch: later.epoch,
         stamp: later.stamp,
         occupancy: known.occupancy.clone(),
         occupied_threshold: known.occupied_threshold,

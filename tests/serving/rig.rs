@@ -56,6 +56,7 @@ pub(crate) fn drive() -> Vec<Snapshot> {
         if let ScanUpdate::Processed(report) = add(&mut filter, &lidar, shot) {
             let version = MapVersion {
                 version: snapshots.len() as u64 + 1,
+                epoch: 1,
                 stamp: shot.scan.stamp,
                 occupancy: filter.occupancy().clone(),
                 occupied_threshold: 0.25,

@@ -13,6 +13,8 @@ store = get_typestore(Stores.ROS2_JAZZY)
 for name, text in {
     "nav_msgs/msg/GetMap_Request": "uint8 structure_needs_at_least_one_member",
     "nav_msgs/msg/GetMap_Response": "nav_msgs/OccupancyGrid map",
+    "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\n"
+    "uint32 width\nuint32 height\nint8[] data",
 }.items():
     store.register(get_types_from_msg(text, name))
 T = {name.split("/")[-1]: kind for name, kind in store.types.items() if "/msg/" in name}
@@ -61,6 +63,9 @@ messages = {
     ),
     "nav_msgs/msg/OccupancyGrid": grid,
     "nav_msgs/msg/MapMetaData": info,
+    "map_msgs/msg/OccupancyGridUpdate": T["OccupancyGridUpdate"](
+        header(3, 4, "map"), 1, -2, 2, 3, f("int8", -1, 0, 100, 0, -1, 100)
+    ),
     "geometry_msgs/msg/PoseStamped": T["PoseStamped"](header(3, 4, "map"), pose(1.0, 2.0, 0.0, 1.0)),
     "geometry_msgs/msg/PoseWithCovarianceStamped": T["PoseWithCovarianceStamped"](
         header(3, 4, "map"), T["PoseWithCovariance"](pose(1.0, 2.0, 0.0, 1.0), covariance)

@@ -1,8 +1,8 @@
 //! Every type that travels, with the hash by which ROS 2 knows its fields (REP-2016).
 
 use super::super::{
-    DiagnosticArray, Float64, LaserScan, MapMetaData, Message as _, OccupancyGrid, Odometry, Path,
-    PoseArray, PoseWithCovarianceStamped, TfMessage,
+    DiagnosticArray, Float64, LaserScan, MapMetaData, Message as _, OccupancyGrid,
+    OccupancyGridUpdate, Odometry, Path, PoseArray, PoseWithCovarianceStamped, TfMessage,
 };
 
 /// A type of message or service.
@@ -43,6 +43,11 @@ pub const MAP_META_DATA: WireType = WireType {
 pub const OCCUPANCY_GRID: WireType = WireType {
     name: OccupancyGrid::TYPE,
     hash: "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+};
+/// `map_msgs/msg/OccupancyGridUpdate`.
+pub const OCCUPANCY_GRID_UPDATE: WireType = WireType {
+    name: OccupancyGridUpdate::TYPE,
+    hash: "RIHS01_c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8",
 };
 /// `nav_msgs/msg/Odometry`.
 pub const ODOMETRY: WireType = WireType {

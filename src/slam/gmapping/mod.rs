@@ -428,6 +428,13 @@ impl GMapping {
         self.parameters.map.occupied_threshold
     }
 
+    /// How often the map became another one since the first scan, not only a larger one: with
+    /// another best particle, the last scans lie elsewhere.
+    #[must_use]
+    pub const fn map_corrections(&self) -> u64 {
+        self.output.corrections()
+    }
+
     /// The map of the best particle, cropped to what is known; `None` before the first scan.
     #[must_use]
     pub fn occupancy_grid(&self) -> Option<OccupancyGrid> {

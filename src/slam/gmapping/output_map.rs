@@ -17,6 +17,7 @@ pub struct OutputMap {
     /// Scans that particles may still place differently; the first belongs to `first_depth`.
     scans: VecDeque<ScanOutline>,
     first_depth: u32,
+    corrections: u64,
 }
 
 impl OutputMap {
@@ -24,7 +25,7 @@ impl OutputMap {
     #[must_use]
     pub fn new(resolution: f64) -> Self {
         let map = OccupancyMap::new(resolution);
-        Self { map, node: None, scans: VecDeque::new(), first_depth: 0 }
+        Self { map, node: None, scans: VecDeque::new(), first_depth: 0, corrections: 0 }
     }
 
     /// The map.
@@ -33,10 +34,17 @@ impl OutputMap {
         &self.map
     }
 
+    /// How often scans in the map were placed anew.
+    #[must_use]
+    pub const fn corrections(&self) -> u64 {
+        self.corrections
+    }
+
     /// Adds the scan of the tree's newest depth and moves to the trajectory that ends at `node`.
     pub fn extend(&mut self, tree: &mut TrajectoryTree, node: NodeId, scan: ScanOutline) {
         self.scans.push_back(scan);
         let shared = self.node.and_then(|old| tree.common_ancestor(old, node));
+        self.corrections += u64::from(shared != self.node);
         let until_shared = |from| tree.ancestry(from).take_while(move |id| Some(*id) != shared);
         for id in self.node.into_iter().flat_map(until_shared) {
             let scan = &self.scans[(tree.depth(id) - self.first_depth) as usize];
@@ -133,6 +141,24 @@ mod tests {
                 prop_assert_eq!(seen(output.map()), seen(&anew));
             }
         }
+    }
+
+    #[test]
+    fn another_branch_is_a_correction_and_the_next_scan_is_none() {
+        let mut tree = TrajectoryTree::default();
+        let mut output = OutputMap::new(0.1);
+        let mut grow = |output: &mut OutputMap, parents: [Option<NodeId>; 2], best: usize| {
+            let leaves = parents.map(|parent| tree.append(parent, Pose2::IDENTITY));
+            output.extend(&mut tree, leaves[best], scan(1.0));
+            (leaves.map(Some), output.corrections())
+        };
+        let (first, corrections) = grow(&mut output, [None, None], 0);
+        assert_eq!(corrections, 0);
+        let (second, corrections) = grow(&mut output, first, 0);
+        assert_eq!(corrections, 0);
+        let (third, corrections) = grow(&mut output, second, 1);
+        assert_eq!(corrections, 1);
+        assert_eq!(grow(&mut output, third, 1).1, 1);
     }
 
     #[test]

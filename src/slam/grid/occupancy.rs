@@ -117,6 +117,12 @@ impl OccupancyMap {
         Self { resolution, counts: TileMap::new(), scratch: Scratch::default() }
     }
 
+    /// Metres a cell.
+    #[must_use]
+    pub const fn resolution(&self) -> f64 {
+        self.resolution
+    }
+
     /// The counts.
     #[must_use]
     pub const fn counts(&self) -> &TileMap<Count> {
@@ -215,7 +221,8 @@ impl OccupancyMap {
 
 impl Count {
     /// -1 for a cell nobody looked at, 100 if its share of hits is above the threshold, else 0.
-    fn occupancy(self, occupied_threshold: f64) -> i8 {
+    #[must_use]
+    pub fn occupancy(self, occupied_threshold: f64) -> i8 {
         if self.visits == 0 {
             -1
         } else if f64::from(self.hits) > occupied_threshold * f64::from(self.visits) {

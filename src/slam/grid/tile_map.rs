@@ -3,7 +3,7 @@
 //! Tiles are gathered in pages, so that a clone of the map copies one short list of pages and a
 //! write copies at most one page of pointers and one tile.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 
 use triomphe::Arc;
 
@@ -102,8 +102,7 @@ impl<C: Copy + Default> TileMap<C> {
     /// A tile, if a cell of it was ever written.
     #[must_use]
     pub fn tile(&self, key: TileKey) -> Option<&Tile<C>> {
-        let found = self.pages.binary_search_by_key(&key.page(), |(page, _)| *page).ok()?;
-        self.pages[found].1.tiles[key.slot()].as_deref()
+        self.page(key.page())?.tiles[key.slot()].as_deref()
     }
 
     /// A tile to write to: created if missing, copied if shared.
@@ -144,6 +143,35 @@ impl<C: Copy + Default> TileMap<C> {
             .filter(move |(key, _)| {
                 (first.tx..=last.tx).contains(&key.tx) && (first.ty..=last.ty).contains(&key.ty)
             })
+    }
+
+    /// The tiles that are not shared with `before`, an earlier or later copy of this map: those
+    /// that were written since one was cloned from the other, and some that hold the same still.
+    ///
+    /// It compares pointers, and of pages that are shared as a whole only one.
+    #[must_use]
+    pub fn tiles_not_shared_with(&self, before: &Self) -> Vec<TileKey> {
+        let mut keys: BTreeSet<TileKey> = BTreeSet::new();
+        for (here, there) in [(self, before), (before, self)] {
+            for (page_key, page) in &here.pages {
+                let other = there.page(*page_key);
+                if other.is_some_and(|other| Arc::ptr_eq(page, other)) {
+                    continue;
+                }
+                let is_other = |key: &TileKey, tile: &Tile<C>| {
+                    let same = other.and_then(|other| other.tiles[key.slot()].as_deref());
+                    !same.is_some_and(|same| std::ptr::eq(same, tile))
+                };
+                let tiles = page.tiles(*page_key).filter(|(key, tile)| is_other(key, tile));
+                keys.extend(tiles.map(|(key, _)| key));
+            }
+        }
+        keys.into_iter().collect()
+    }
+
+    fn page(&self, key: TileKey) -> Option<&Arc<Page<C>>> {
+        let found = self.pages.binary_search_by_key(&key, |(page, _)| *page).ok()?;
+        Some(&self.pages[found].1)
     }
 
     /// Every written tile, page by page.
@@ -224,6 +252,28 @@ mod tests {
         let counts = TileCounts::of([&a, &b].into_iter());
         assert_eq!((counts.referenced, counts.distinct), (4, 3));
         assert_eq!(a.get(Cell::new(5, 5)), 0);
+    }
+
+    proptest! {
+        #[test]
+        fn written_tiles_are_told_and_no_others(
+            before in proptest::collection::vec((SPREAD, SPREAD), 0..40),
+            after in proptest::collection::vec((SPREAD, SPREAD), 0..20),
+        ) {
+            let mut old = TileMap::<u8>::new();
+            for (ix, iy) in before {
+                *old.get_mut(Cell::new(ix, iy)) += 1;
+            }
+            let mut new = old.clone();
+            let mut written = BTreeSet::new();
+            for (ix, iy) in after {
+                *new.get_mut(Cell::new(ix, iy)) += 1;
+                written.insert(TileKey::containing(Cell::new(ix, iy)));
+            }
+            let written: Vec<_> = written.into_iter().collect();
+            prop_assert_eq!(&new.tiles_not_shared_with(&old), &written);
+            prop_assert_eq!(&old.tiles_not_shared_with(&new), &written);
+        }
     }
 
     #[test]

@@ -5,12 +5,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use sha2::{Digest as _, Sha256};
 
 use super::{
-    DIAGNOSTIC_ARRAY, FLOAT64, GET_MAP, LASER_SCAN, MAP_META_DATA, OCCUPANCY_GRID, ODOMETRY, PATH,
-    POSE_ARRAY, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, WireType,
+    DIAGNOSTIC_ARRAY, FLOAT64, GET_MAP, LASER_SCAN, MAP_META_DATA, OCCUPANCY_GRID,
+    OCCUPANCY_GRID_UPDATE, ODOMETRY, PATH, POSE_ARRAY, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE,
+    WireType,
 };
 
 /// Each type with its fields, one a line, as in the `.msg` files of ROS 2.
-const DEFINITIONS: [(&str, &str); 26] = [
+const DEFINITIONS: [(&str, &str); 27] = [
     ("builtin_interfaces/msg/Time", "int32 sec\nuint32 nanosec"),
     ("std_msgs/msg/Header", "builtin_interfaces/Time stamp\nstring frame_id"),
     ("std_msgs/msg/Float64", "float64 data"),
@@ -54,6 +55,10 @@ const DEFINITIONS: [(&str, &str); 26] = [
         "nav_msgs/msg/MapMetaData",
         "builtin_interfaces/Time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\n\
          geometry_msgs/Pose origin",
+    ),
+    (
+        "map_msgs/msg/OccupancyGridUpdate",
+        "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data",
     ),
     (
         "nav_msgs/msg/OccupancyGrid",
@@ -188,13 +193,14 @@ fn hash(name: &str) -> String {
 
 #[test]
 fn hashes_are_those_of_the_definitions() {
-    let types: [WireType; 11] = [
+    let types: [WireType; 12] = [
         DIAGNOSTIC_ARRAY,
         FLOAT64,
         GET_MAP,
         LASER_SCAN,
         MAP_META_DATA,
         OCCUPANCY_GRID,
+        OCCUPANCY_GRID_UPDATE,
         ODOMETRY,
         PATH,
         POSE_ARRAY,

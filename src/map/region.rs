@@ -1,0 +1,301 @@
+//! A part of the map, or the whole, in coarser cells.
+
+use serde::Serialize;
+use thiserror::Error;
+
+use super::tiles::Extent;
+use crate::slam::grid::Cell;
+use crate::slam::grid::occupancy::{Count, OccupancyGrid, OccupancyMap};
+use crate::slam::grid::tile_map::{TILE_SIZE, TileKey};
+use crate::slam::pose::Point2;
+
+/// Cells that a region may have.
+pub const MOST_CELLS: u64 = 1 << 24;
+
+/// How far, in cells, a corner may be beside the edge between two cells and still be on it.
+const ON_EDGE: f64 = 1e-6;
+
+/// A rectangle in `map`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Window {
+    /// Its lower-left corner, m.
+    pub low: Point2,
+    /// Its upper-right corner, m.
+    pub high: Point2,
+}
+
+/// The cells that a window is answered with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Region {
+    /// In cells of the region, whose cell (0, 0) begins at the origin of `map`.
+    extent: Extent,
+    /// Cells of the map along the side of one of the region.
+    factor: i32,
+    /// Metres a cell of the region.
+    resolution: f64,
+}
+
+/// Why a region cannot be had.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum RegionError {
+    /// Finer than the map.
+    #[error("res={asked} is finer than the map, which has {map} m a cell")]
+    Finer {
+        /// Metres a cell.
+        asked: f64,
+        /// Metres a cell of the map.
+        map: f64,
+    },
+    /// It would not fit a message.
+    #[error(
+        "the region has {width:.0} by {height:.0} cells of {resolution} m, and {MOST_CELLS} are \
+         the most; ask for a smaller one, or for a larger res"
+    )]
+    TooLarge {
+        /// Columns.
+        width: f64,
+        /// Rows.
+        height: f64,
+        /// Metres a cell.
+        resolution: f64,
+    },
+}
+
+/// What is known of each cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Layer {
+    /// -1 unknown, 0 free, 100 occupied.
+    Occupancy,
+    /// Scans in which a beam ended in the cell.
+    Hits,
+    /// Scans that saw the cell.
+    Visits,
+}
+
+impl Layer {
+    /// As queries and answers call it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Occupancy => "occupancy",
+            Self::Hits => "hits",
+            Self::Visits => "visits",
+        }
+    }
+}
+
+impl Region {
+    /// The window's cells, of at least `resolution` metres: it is widened to whole ones.
+    ///
+    /// They are as many whole cells of the map wide as it takes, and lie so that neighbouring
+    /// windows fit together.
+    ///
+    /// # Errors
+    /// When `resolution` is finer than the map's, or the cells are too many.
+    pub fn new(window: Window, resolution: f64, map_resolution: f64) -> Result<Self, RegionError> {
+        let ratio = resolution / map_resolution;
+        if ratio < 1.0 - ON_EDGE {
+            return Err(RegionError::Finer { asked: resolution, map: map_resolution });
+        }
+        let factor = libm::ceil(ratio - ON_EDGE);
+        let resolution = factor * map_resolution;
+        let first = |low: f64| libm::floor(low / resolution + ON_EDGE);
+        let end = |high: f64| libm::ceil(high / resolution - ON_EDGE);
+        let (x, y) = (first(window.low.x), first(window.low.y));
+        let (width, height) = (end(window.high.x) - x, end(window.high.y) - y);
+        if width * height > MOST_CELLS as f64 {
+            return Err(RegionError::TooLarge { width, height, resolution });
+        }
+        let extent = Extent {
+            ix: x as i32,
+            iy: y as i32,
+            width: width.max(0.0) as u32,
+            height: height.max(0.0) as u32,
+        };
+        Ok(Self { extent, factor: factor as i32, resolution })
+    }
+
+    /// Occupied where a cell of the map is, free where one is and none is occupied, unknown where
+    /// nothing is known.
+    #[must_use]
+    pub fn occupancy(&self, map: Option<&OccupancyMap>, occupied_threshold: f64) -> OccupancyGrid {
+        let cells = self.maxima(map, -1, |count| count.occupancy(occupied_threshold));
+        let corner = |i: i32| f64::from(i) * self.resolution;
+        OccupancyGrid {
+            resolution: self.resolution,
+            width: self.extent.width as usize,
+            height: self.extent.height as usize,
+            origin: Point2::new(corner(self.extent.ix), corner(self.extent.iy)),
+            cells,
+        }
+    }
+
+    fn layer(&self, layer: Layer, map: Option<&OccupancyMap>, threshold: f64) -> Vec<i64> {
+        match layer {
+            Layer::Occupancy => self.maxima(map, -1, |count| count.occupancy(threshold).into()),
+            Layer::Hits => self.maxima(map, 0, |count| count.hits.into()),
+            Layer::Visits => self.maxima(map, 0, |count| count.visits.into()),
+        }
+    }
+
+    /// Layers as JSON: size and place as in the JSON of a map, and in `layers` the runs of each,
+    /// the largest value of the merged cells in each.
+    #[must_use]
+    pub fn json(&self, layers: &[Layer], map: Option<&OccupancyMap>, threshold: f64) -> String {
+        let corner = |i: i32| f64::from(i) * self.resolution;
+        let runs = layers.iter().map(|&layer| {
+            let cells = self.layer(layer, map, threshold);
+            let runs = cells.chunk_by(|a, b| a == b).map(|run| (run[0], run.len()));
+            (layer.name().to_owned(), serde_json::json!(runs.collect::<Vec<_>>()))
+        });
+        let layers = Layers {
+            resolution: self.resolution,
+            width: self.extent.width,
+            height: self.extent.height,
+            origin: [corner(self.extent.ix), corner(self.extent.iy)],
+            layers: runs.collect(),
+        };
+        serde_json::to_string(&layers).expect("memory takes every write, and every key is a string")
+    }
+
+    /// The largest value of the known cells that each cell of the region covers.
+    fn maxima<T: Copy + Ord>(
+        &self,
+        map: Option<&OccupancyMap>,
+        unknown: T,
+        value: impl Fn(Count) -> T,
+    ) -> Vec<T> {
+        let (width, height) = (self.extent.width as usize, self.extent.height as usize);
+        let mut cells = vec![unknown; width * height];
+        let Some(map) = map else { return cells };
+        let fine = |i: i32, count: u32| {
+            let first = i64::from(i) * i64::from(self.factor);
+            let last = first + i64::from(count) * i64::from(self.factor) - 1;
+            [first, last].map(|i| i.clamp(i32::MIN.into(), i32::MAX.into()) as i32)
+        };
+        let ([left, right], [bottom, top]) =
+            (fine(self.extent.ix, self.extent.width), fine(self.extent.iy, self.extent.height));
+        let first = TileKey::containing(Cell::new(left, bottom));
+        let last = TileKey::containing(Cell::new(right, top));
+        for (key, counts) in map.counts().tiles_between(first, last) {
+            let corner = key.first_cell();
+            for (i, &count) in counts.iter().enumerate().filter(|(_, count)| count.visits > 0) {
+                let ix = corner.ix + (i % TILE_SIZE) as i32;
+                let iy = corner.iy + (i / TILE_SIZE) as i32;
+                let column = i64::from(ix.div_euclid(self.factor)) - i64::from(self.extent.ix);
+                let row = i64::from(iy.div_euclid(self.factor)) - i64::from(self.extent.iy);
+                let (Ok(column), Ok(row)) = (usize::try_from(column), usize::try_from(row)) else {
+                    continue;
+                };
+                if column < width && row < height {
+                    let cell = &mut cells[row * width + column];
+                    *cell = (*cell).max(value(count));
+                }
+            }
+        }
+        cells
+    }
+}
+
+#[derive(Serialize)]
+struct Layers {
+    resolution: f64,
+    width: u32,
+    height: u32,
+    origin: [f64; 2],
+    layers: serde_json::Map<String, serde_json::Value>,
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::{prop_assert_eq, proptest};
+
+    use super::*;
+    use crate::slam::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
+    use crate::slam::pose::Pose2;
+
+    const FINE: f64 = 0.1;
+
+    /// A robot at the origin that sees a wall.
+    fn map() -> OccupancyMap {
+        let mut map = OccupancyMap::new(FINE);
+        let end = |y| BeamEnd { point: [2.05, y], kind: BeamEndKind::Hit };
+        let ends = (-8..=8).map(|step| end(step as f32 * 0.1)).collect();
+        let outline = ScanOutline { sensor: Point2::new(0.0, 0.0), ends, angle_increment: 0.05 };
+        map.add(&outline, Pose2::IDENTITY);
+        map
+    }
+
+    fn window(low: [f64; 2], high: [f64; 2]) -> Window {
+        Window { low: Point2::new(low[0], low[1]), high: Point2::new(high[0], high[1]) }
+    }
+
+    proptest! {
+        /// Cell by cell, from the map as it is handed out.
+        #[test]
+        fn a_cell_has_the_largest_value_of_those_it_covers(
+            x in -3.0..3.0_f64, y in -3.0..3.0_f64, size in 0.05..3.0_f64, res in 0.1..1.0_f64,
+        ) {
+            let (map, window) = (map(), window([x, y], [x + size, y + size]));
+            let region = Region::new(window, res, FINE).unwrap();
+            let coarse = region.occupancy(Some(&map), 0.25);
+            let factor = (coarse.resolution / FINE).round() as i32;
+            assert!(coarse.resolution >= res - 1e-6 && coarse.resolution < res + FINE + 1e-6);
+            assert!(coarse.origin.x <= x + 1e-6 && coarse.origin.y <= y + 1e-6);
+            let right = coarse.origin.x + coarse.width as f64 * coarse.resolution;
+            assert!(right >= x + size - 1e-6 && right < x + size + coarse.resolution);
+            for (i, &cell) in coarse.cells.iter().enumerate() {
+                let ix = region.extent.ix + (i % coarse.width) as i32;
+                let iy = region.extent.iy + (i / coarse.width) as i32;
+                let covered = (0..factor * factor).map(|k| {
+                    let cell = Cell::new(ix * factor + k % factor, iy * factor + k / factor);
+                    map.counts().get(cell).occupancy(0.25)
+                });
+                prop_assert_eq!(cell, covered.max().unwrap());
+            }
+        }
+    }
+
+    #[test]
+    fn walls_stay_and_the_unknown_stays_unknown() {
+        let region = Region::new(window([-4.0, -2.0], [4.0, 2.0]), 0.8, FINE).unwrap();
+        let grid = region.occupancy(Some(&map()), 0.25);
+        assert_eq!((grid.width, grid.height), (10, 6));
+        let row = &grid.cells[30..40];
+        assert_eq!(row, [-1, -1, -1, -1, -1, 0, 0, 100, -1, -1]);
+    }
+
+    #[test]
+    fn layers_have_the_largest_count() {
+        let mut map = map();
+        let clone = map.clone();
+        for _ in 0..2 {
+            let end = BeamEnd { point: [2.05, 0.05], kind: BeamEndKind::Hit };
+            let sensor = Point2::new(0.0, 0.0);
+            let outline = ScanOutline { sensor, ends: vec![end], angle_increment: 0.05 };
+            map.add(&outline, Pose2::IDENTITY);
+        }
+        let region = Region::new(window([2.0, 0.0], [2.2, 0.2]), 0.2, FINE).unwrap();
+        let text = region.json(&[Layer::Hits, Layer::Visits], Some(&map), 0.25);
+        assert_eq!(
+            text,
+            r#"{"resolution":0.2,"width":1,"height":1,"origin":[2.0,0.0],"layers":{"hits":[[3,1]],"visits":[[3,1]]}}"#
+        );
+        let text = region.json(&[Layer::Hits], Some(&clone), 0.25);
+        assert!(text.ends_with(r#""layers":{"hits":[[1,1]]}}"#), "{text}");
+        let text = region.json(&[Layer::Occupancy, Layer::Hits], None, 0.25);
+        assert!(text.ends_with(r#""layers":{"hits":[[0,1]],"occupancy":[[-1,1]]}}"#), "{text}");
+    }
+
+    #[test]
+    fn what_cannot_be_had_is_told() {
+        let small = window([0.0, 0.0], [1.0, 1.0]);
+        let error = Region::new(small, 0.05, FINE).unwrap_err().to_string();
+        assert_eq!(error, "res=0.05 is finer than the map, which has 0.1 m a cell");
+        let large = window([-1e6, -1e6], [1e6, 1e6]);
+        let error = Region::new(large, 0.1, FINE).unwrap_err().to_string();
+        assert!(error.starts_with("the region has 20000000 by 20000000 cells of 0.1 m"), "{error}");
+        let coarse = Region::new(large, 1e4, FINE).unwrap();
+        assert_eq!(coarse.occupancy(Some(&map()), 0.25).cells.iter().max(), Some(&100));
+    }
+}
