@@ -249,7 +249,11 @@ async fn a_client_that_does_not_read_slows_no_other() {
         held.lock().unwrap().recv().ok();
     };
     dead.declare_subscriber(format!("{ROBOT}/**")).callback(stuck).background().await.unwrap();
-    ask(&dead, "slam/status").await.expect("the daemon knows of it now");
+    let probe = rig.daemon.declare_publisher(format!("{ROBOT}/probe")).await.unwrap();
+    let matching = probe.matching_listener().await.unwrap();
+    while !probe.matching_status().await.unwrap().matching() {
+        matching.recv_async().await.unwrap();
+    }
     let mirror = follow(&rig.client).await;
     until(&mirror, has(&drive[0])).await;
     for snapshot in drive.iter().cycle().skip(1).take(100).enumerate().map(numbered) {
