@@ -15,6 +15,7 @@ fn settings() -> Settings {
         odometry_timeout: TIMEOUT,
         most_waiting: 4,
         source: OdometrySource::Auto,
+        need: Need::Required,
         odom_key: "robot01/odom".to_owned(),
         tf_path: "robot01/tf (from `odom` to `base_link`)".to_owned(),
     }
@@ -76,7 +77,8 @@ impl Rig {
     fn told(&mut self) -> Vec<String> {
         let told = |call| match call {
             Call::Odometry(_, pose) => format!("o{}", pose.x),
-            Call::Scan(ready) => format!("s{}", ready.odom_from_base.x),
+            Call::Scan(ReadyScan { odom_from_base: Some(pose), .. }) => format!("s{}", pose.x),
+            Call::Scan(_) => "s-".to_owned(),
             Call::Refuse(refusal) => {
                 let after = refusal.stamp.unwrap().seconds_since(stamp(0)) * 1e3;
                 format!("{:?}{after:.0}", refusal.verdict)
