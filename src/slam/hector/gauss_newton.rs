@@ -9,11 +9,9 @@ use nalgebra::{Matrix3, Vector3};
 use super::super::grid::Cell;
 use super::super::grid::log_odds::{LogOdds, LogOddsMap, Probabilities};
 use super::super::grid::tile_map::Window;
-use super::super::pose::{Pose2, wrap_angle};
+use super::super::pose::{Point2, Pose2, wrap_angle};
 use super::weakness::Weakness;
 
-/// Residuals of beams that end in unknown or free space have this share of independent noise.
-pub const RESIDUAL_VARIANCE: f64 = 1.0;
 /// Steps at most, cells: bilinear interpolation sees no further.
 const LONGEST_STEP: f64 = 2.0;
 /// Steps below this, cells, end the search.
@@ -77,7 +75,7 @@ impl<'a> Level<'a> {
         let reach = (radius + MARGIN * resolution).min(1e4);
         let corner = |sign: f64| {
             let at = near.position();
-            let at = super::Point2::new(at.x + sign * reach, at.y + sign * reach);
+            let at = Point2::new(at.x + sign * reach, at.y + sign * reach);
             Cell::containing(at, resolution)
         };
         let window = Window::between(map.cells(), corner(-1.0), corner(1.0));
@@ -225,7 +223,9 @@ pub struct Problem<'a> {
 }
 
 impl Problem<'_> {
-    fn cost(&self, fit: &Fit, pose: Pose2) -> f64 {
+    /// The negative log likelihood of a pose, but for a constant.
+    #[must_use]
+    pub fn cost(&self, fit: &Fit, pose: Pose2) -> f64 {
         0.5 * self.gain * fit.cost + self.prior.cost(pose)
     }
 

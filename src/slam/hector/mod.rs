@@ -7,6 +7,7 @@
 
 pub mod correlation;
 pub mod gauss_newton;
+pub mod matcher;
 mod parameters;
 pub mod prediction;
 pub mod prepared_scan;
@@ -15,32 +16,21 @@ pub mod weakness;
 
 use nalgebra::Matrix3;
 
-use self::correlation::Search;
-use self::gauss_newton::{Fit, Level, Problem};
+use self::matcher::Placed;
 pub use self::parameters::Parameters;
 use self::prediction::Prediction;
 use self::prepared_scan::{Directions, PreparedScan};
 use self::pyramid::Pyramid;
-use self::weakness::Weakness;
 use super::engine::Sweep;
 use super::grid::occupancy::{Count, OccupancyMap};
 use super::grid::tile_map::{TileCounts, TileKey};
 use super::odometry::Motion;
 use super::path::Path;
-use super::pose::{Point2, Pose2, Stamp};
+use super::pose::{Pose2, Stamp};
 use super::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipReason};
 
-/// Steps on the coarse maps and on the finest, as in the original.
-const COARSE_STEPS: usize = 4;
-const FINE_STEPS: usize = 6;
-/// A prior less sure than this many cells of the coarsest map is bettered by a search.
-const POOR_PRIOR: f64 = 0.5;
-/// A match counts if its points lie in cells of this probability on average.
-const LEAST_MEAN: f64 = 0.3;
-/// Independent beams among those of a scan: neighbours err alike.
-const GAIN: f64 = 1.0;
-/// What a hit in an occupied cell is worth to the search, nats.
-const SEARCH_GAIN: f64 = 1.0;
+/// How much of the usual score each scan renews.
+const RENEWAL: f64 = 0.1;
 
 /// The engine.
 #[derive(Debug)]
@@ -64,6 +54,8 @@ struct State {
     covariance: Matrix3<f64>,
     /// Since the processed scan before, a second; for want of odometry.
     velocity: Option<Pose2>,
+    /// What scans score a point, on average over the last.
+    usual_score: f64,
     /// Where the robot was at the last scan that entered the map.
     registered_at: Pose2,
 }
@@ -74,16 +66,6 @@ struct Odometry {
     odom_from_base: Option<Pose2>,
     since_processed: Motion,
     map_from_odom: Option<Pose2>,
-}
-
-/// A scan's place.
-#[derive(Debug)]
-struct Placed {
-    pose_in_map: Pose2,
-    covariance: Matrix3<f64>,
-    matched: bool,
-    score: f64,
-    weakness: Weakness,
 }
 
 impl Hector {
@@ -184,37 +166,12 @@ impl Hector {
 
     /// Where the scan was taken, as far as the map, odometry and the motion so far tell.
     fn place(&self, scan: &PreparedScan, sweep: &Sweep<'_>) -> Placed {
-        let lever = lever(&scan.hits);
-        let weakness = Weakness::of(&scan.hits, lever);
         let Some(state) = &self.state else {
             let odometry = sweep.odom_from_base.unwrap_or_default();
-            let pose_in_map = self.parameters.initial_pose.unwrap_or(odometry);
-            let covariance = Matrix3::zeros();
-            return Placed { pose_in_map, covariance, matched: true, score: 0.0, weakness };
+            return Placed::first(scan, self.parameters.initial_pose.unwrap_or(odometry));
         };
         let prediction = self.predict(state, sweep);
-        let Some(prior) = prediction.prior() else {
-            let Prediction { pose_in_map, covariance } = prediction;
-            return Placed { pose_in_map, covariance, matched: false, score: 0.0, weakness };
-        };
-        let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
-        let levels: Vec<Level<'_>> = self.pyramid.levels(scan, prior.pose_in_map).collect();
-        let mut start = prior.pose_in_map;
-        let deviations = prediction.deviations();
-        let poor = POOR_PRIOR * levels[0].resolution();
-        if deviations[0] > poor || deviations[1] * lever > poor {
-            let gain = SEARCH_GAIN;
-            let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
-            start = search.run();
-        }
-        let (pose, fit) = descend(&levels, &problem, start);
-        let points = levels.last().map_or(0, |level| level.points().len()) as f64;
-        let score = points - fit.cost;
-        let (hessian, _) = weakness.without(&fit, pose.theta);
-        let information = GAIN * hessian + prior.information;
-        let covariance = information.try_inverse().unwrap_or(prediction.covariance);
-        let matched = score > LEAST_MEAN * points;
-        Placed { pose_in_map: pose, covariance, matched, score, weakness }
+        matcher::place(&self.pyramid, scan, &prediction, state.usual_score)
     }
 
     fn predict(&self, state: &State, sweep: &Sweep<'_>) -> Prediction {
@@ -244,8 +201,11 @@ impl Hector {
             let seconds = stamp.seconds_since(state.stamp);
             prediction::velocity(state.pose_in_map.between(pose_in_map), seconds)
         });
+        let score = if placed.points > 0.0 { placed.score / placed.points } else { 1.0 };
+        let usual = self.state.map_or(1.0, |state| state.usual_score);
         self.state = Some(State {
             stamp,
+            usual_score: usual + RENEWAL * (score - usual),
             pose_in_map,
             covariance: placed.covariance,
             velocity,
@@ -321,22 +281,6 @@ impl Odometry {
     fn anchor(&mut self, pose_in_map: Pose2) {
         self.map_from_odom = self.odom_from_base.map(|odom| pose_in_map * odom.inverse());
     }
-}
-
-/// Coarse to fine.
-fn descend(levels: &[Level<'_>], problem: &Problem<'_>, start: Pose2) -> (Pose2, Fit) {
-    let (finest, coarse) = levels.split_last().expect("there is a finest level");
-    let mut pose = start;
-    for level in coarse {
-        (pose, _) = level.descend(problem, pose, COARSE_STEPS);
-    }
-    finest.descend(problem, pose, FINE_STEPS)
-}
-
-/// Root mean square distance of the hits from the base, m.
-fn lever(hits: &[[f32; 2]]) -> f64 {
-    let sum: f32 = hits.iter().map(|[x, y]| x * x + y * y).sum();
-    (f64::from(sum) / hits.len().max(1) as f64).sqrt().max(0.1)
 }
 
 /// The map that is handed out, brought up to date when it is asked for.

@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
-use super::super::pose::Pose2;
+use super::super::pose::{Point2, Pose2};
 use super::super::update::WeakDirection;
 use super::gauss_newton::Fit;
 
@@ -19,7 +19,7 @@ const GAP: f32 = 0.2;
 /// ... unless they are nearer than this, m.
 const SMALL_GAP: f32 = 0.2;
 /// A direction is weak if less than this share of the surfaces stands against it.
-const WEAK: f64 = 0.012;
+const WEAK: f64 = 0.015;
 
 /// What a scan does not tell; nothing where all is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,7 +48,7 @@ impl Weakness {
     #[must_use]
     pub fn direction_in_map(&self, theta: f64) -> Option<WeakDirection> {
         let direction = self.direction?;
-        let turned = Pose2::new(0.0, 0.0, theta) * super::Point2::new(direction.x, direction.y);
+        let turned = Pose2::new(0.0, 0.0, theta) * Point2::new(direction.x, direction.y);
         Some(WeakDirection { x: turned.x, y: turned.y, turn: direction.z })
     }
 
