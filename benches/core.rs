@@ -9,12 +9,14 @@ use std::fmt;
 use divan::{Bencher, black_box};
 use gmapd::sim::lidar::Lidar;
 use gmapd::sim::{Place, Scenario, Simulation};
+use gmapd::slam::engine::Sweep as Taken;
 use gmapd::slam::gmapping::prepared_scan::PreparedScan;
 use gmapd::slam::gmapping::resampling::{effective_sample_size, normalize, systematic};
 use gmapd::slam::gmapping::scan_matcher::FieldMatcher;
 use gmapd::slam::gmapping::{GMapping, Parameters, ScanReading};
 use gmapd::slam::grid::likelihood_field::LikelihoodField;
 use gmapd::slam::grid::occupancy::OccupancyMap;
+use gmapd::slam::hector::{self, Hector};
 use gmapd::slam::motion_gate::MotionGate;
 use gmapd::slam::odometry::Motion;
 use gmapd::slam::pose::Pose2;
@@ -176,4 +178,47 @@ fn add_scan(bencher: Bencher<'_, '_>, size: Size) {
     bencher
         .with_inputs(|| sweeps.next().expect("as many scans as samples"))
         .bench_local_values(&mut add);
+}
+
+/// The sweeps of the first seconds of the tour, ten a second.
+fn steady(beams: usize, count: usize) -> (LaserMount, Vec<Sweep>) {
+    let scenario = Scenario { beams, ..Scenario::new(Place::Building, 1) };
+    let simulation = Simulation::new(&scenario).expect("enough beams");
+    let sweeps = simulation.readings().take(count).map(|reading| Sweep {
+        scan: reading.scan,
+        odom_from_base: reading.odom_from_base,
+        world_from_base: reading.world_from_base,
+    });
+    (simulation.lidar.mount, sweeps.collect())
+}
+
+/// Hector's whole work on scan after scan at 10 Hz and 0.8 m/s: all are matched, and with
+/// hector_mapping's thresholds about every sixth enters the maps.
+#[divan::bench(args = [360, 1080], sample_count = 20, sample_size = 1)]
+fn hector_thirty_scans(bencher: Bencher<'_, '_>, beams: usize) {
+    hector_scans(bencher, beams, hector::Parameters::default());
+}
+
+/// The same with every scan entering the maps.
+#[divan::bench(args = [360, 1080], sample_count = 20, sample_size = 1)]
+fn hector_thirty_scans_all_entering(bencher: Bencher<'_, '_>, beams: usize) {
+    let parameters = hector::Parameters { update_distance: 0.0, ..hector::Parameters::default() };
+    hector_scans(bencher, beams, parameters);
+}
+
+fn hector_scans(bencher: Bencher<'_, '_>, beams: usize, parameters: hector::Parameters) {
+    let (mount, sweeps) = steady(beams, LEARNED + 20 * 30);
+    let mut engine = Hector::new(parameters);
+    let mut add = |Sweep { scan, odom_from_base, .. }: &Sweep| {
+        let taken = Taken { scan, mount: &mount, odom_from_base: Some(*odom_from_base) };
+        engine.add_scan(&taken, &mut |_| ())
+    };
+    let (first, rest) = sweeps.split_at(LEARNED);
+    for sweep in first {
+        add(sweep);
+    }
+    let mut thirties = rest.chunks_exact(30);
+    bencher
+        .with_inputs(|| thirties.next().expect("as many scans as samples take"))
+        .bench_local_values(|sweeps| sweeps.iter().for_each(|sweep| drop(add(sweep))));
 }

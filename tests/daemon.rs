@@ -420,6 +420,21 @@ async fn without_odometry_the_verdict_says_so_and_how_much_is_missing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn hector_maps_from_scans_alone_and_says_how_many_came_without_odometry() {
+    let moments = drive(6);
+    let mut rig = Rig::mounted(&["engine=hector", "odometry_timeout_s=0.05"]).await;
+    for moment in &moments {
+        rig.robot.scan(moment).await;
+        assert_eq!(rig.verdict().await.verdict, Verdict::Processed);
+    }
+    let status = rig.daemon.status();
+    assert_eq!(status.filter.scans_without_odometry, 6, "{}", status.detail);
+    assert_eq!(status.filter.particles, 1);
+    assert!(status.map.is_some_and(|map| map.known_area_m2 > 1.0));
+    rig.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn of_too_many_scans_the_oldest_are_dropped_and_counted() {
     let moments = drive(6);
     let mut rig = Rig::mounted(&["odometry_timeout_s=5", "scan_queue=2"]).await;

@@ -39,6 +39,8 @@ pub struct Settings {
     pub map_frame: String,
     /// The frame of odometry.
     pub odom_frame: String,
+    /// Frame of the robot.
+    pub base_frame: String,
     /// Metres a cell, for the map before there is one.
     pub resolution: f64,
     /// Between two publications of the map at least.
@@ -59,6 +61,7 @@ impl Settings {
         Self {
             map_frame: raw.map_frame.clone(),
             odom_frame: raw.odom_frame.clone(),
+            base_frame: raw.base_frame.clone(),
             resolution: raw.resolution,
             map_update_interval: duration(raw.map_update_interval),
             transform_publish_period: duration(raw.transform_publish_period),

@@ -41,10 +41,21 @@ pub struct Settings {
     pub most_waiting: usize,
     /// Where odometry comes from.
     pub source: OdometrySource,
+    /// Whether scans are of use without odometry.
+    pub need: Need,
     /// The key of odometry messages.
     pub odom_key: String,
     /// Which transforms tell odometry, in words: key and frames.
     pub tf_path: String,
+}
+
+/// What becomes of a scan whose odometry does not come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Need {
+    /// It is refused.
+    Required,
+    /// It goes without. While no odometry has come at all, only the first waits for it.
+    Optional,
 }
 
 /// Odometry's messages or its transforms.
@@ -83,8 +94,8 @@ pub struct ReadyScan {
     pub scan: Scan,
     /// How the laser sits.
     pub mount: LaserMount,
-    /// The base at the scan's stamp.
-    pub odom_from_base: Pose2,
+    /// The base at the scan's stamp; `None` if it goes without odometry.
+    pub odom_from_base: Option<Pose2>,
 }
 
 /// A scan that does not reach the filter.
@@ -114,6 +125,8 @@ pub struct ScanCounts {
 struct Waiting {
     framed: FramedScan,
     since: Instant,
+    /// Whether it has waited long enough to go without odometry.
+    goes_without: bool,
 }
 
 impl Waiting {
@@ -154,6 +167,8 @@ pub struct Synchronizer {
     suspect: Option<Stamp>,
     calls: VecDeque<Call>,
     counts: ScanCounts,
+    /// Whether a scan has waited for the first odometry in vain.
+    waited_in_vain: bool,
 }
 
 impl Synchronizer {
@@ -170,6 +185,7 @@ impl Synchronizer {
             suspect: None,
             calls: VecDeque::new(),
             counts: ScanCounts::default(),
+            waited_in_vain: false,
         }
     }
 
@@ -203,6 +219,7 @@ impl Synchronizer {
         let wanted = match self.settings.source {
             OdometrySource::Odom => channel == Channel::Messages,
             OdometrySource::Tf => channel == Channel::Transforms,
+            OdometrySource::None => false,
             OdometrySource::Auto => match self.channel {
                 None => true,
                 Some(Channel::Transforms) if channel == Channel::Messages && self.fed.is_none() => {
@@ -232,7 +249,7 @@ impl Synchronizer {
             return;
         }
         self.counts.reordered += u64::from(position < self.waiting.len());
-        self.waiting.insert(position, Waiting { framed, since: now });
+        self.waiting.insert(position, Waiting { framed, since: now, goes_without: false });
         self.release(frames);
         self.make_room();
     }
@@ -290,8 +307,13 @@ impl Synchronizer {
     }
 
     fn give_up(&mut self, frames: &Frames, which: impl Fn(&Waiting) -> bool) {
-        for waiting in std::mem::take(&mut self.waiting) {
-            match self.place(&waiting.framed, frames) {
+        for mut waiting in std::mem::take(&mut self.waiting) {
+            match self.place(&waiting, frames) {
+                Err(lack) if which(&waiting) && self.can_go_without(&lack) => {
+                    waiting.goes_without = true;
+                    self.waited_in_vain = true;
+                    self.waiting.push_back(waiting);
+                }
                 Err(lack) if which(&waiting) => {
                     self.refuse(waiting.stamp(), lack.verdict, lack.detail);
                 }
@@ -354,7 +376,7 @@ impl Synchronizer {
     /// after it.
     fn release(&mut self, frames: &Frames) {
         while let Some(first) = self.waiting.pop_front() {
-            match self.place(&first.framed, frames) {
+            match self.place(&first, frames) {
                 Ok((mount, odom_from_base)) => {
                     let scan = first.framed.scan;
                     self.feed(scan.stamp);
@@ -385,8 +407,12 @@ impl Synchronizer {
     }
 
     /// How the laser sat and where odometry had the base when a scan was taken.
-    fn place(&self, framed: &FramedScan, frames: &Frames) -> Result<(LaserMount, Pose2), Lack> {
-        let stamp = framed.scan.stamp;
+    fn place(
+        &self,
+        waiting: &Waiting,
+        frames: &Frames,
+    ) -> Result<(LaserMount, Option<Pose2>), Lack> {
+        let (framed, stamp) = (&waiting.framed, waiting.stamp());
         let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
             let (verdict, chance) = match error {
                 MountError::Tilted { .. } => (Verdict::TiltedMount, Chance::Gone),
@@ -395,7 +421,22 @@ impl Synchronizer {
             };
             Lack { verdict, detail: error.to_string(), chance }
         })?;
-        Ok((mount, self.odometry_at(stamp)?))
+        let none_comes = self.channel.is_none() && self.waited_in_vain;
+        if self.settings.source == OdometrySource::None || none_comes {
+            return Ok((mount, None));
+        }
+        match self.odometry_at(stamp) {
+            Ok(odom_from_base) => Ok((mount, Some(odom_from_base))),
+            Err(lack) if self.can_go_without(&lack) => {
+                let now = waiting.goes_without || lack.chance == Chance::Gone;
+                if now { Ok((mount, None)) } else { Err(lack) }
+            }
+            Err(lack) => Err(lack),
+        }
+    }
+
+    fn can_go_without(&self, lack: &Lack) -> bool {
+        self.settings.need == Need::Optional && lack.verdict == Verdict::NoOdometry
     }
 
     fn odometry_at(&self, stamp: Stamp) -> Result<Pose2, Lack> {
@@ -448,7 +489,9 @@ impl Synchronizer {
         match (source, self.channel) {
             (OdometrySource::Odom, _) | (_, Some(Channel::Messages)) => format!("on {odom_key}"),
             (OdometrySource::Tf, _) | (_, Some(Channel::Transforms)) => format!("in {tf_path}"),
-            (OdometrySource::Auto, None) => format!("on {odom_key} or in {tf_path}"),
+            (OdometrySource::Auto | OdometrySource::None, None) => {
+                format!("on {odom_key} or in {tf_path}")
+            }
         }
     }
 }

@@ -5,6 +5,7 @@ use nalgebra::Matrix3;
 use super::gmapping::{GMapping, Parameters, ThreadsError};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
+use super::hector::{self, Hector};
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
@@ -15,6 +16,8 @@ use super::update::{OdometryUpdate, OnPhase, ScanReading, ScanUpdate, SkipReason
 pub enum EngineParameters {
     /// A particle filter, with the seed of its random numbers.
     GMapping(Parameters, u64),
+    /// One hypothesis, by matching each scan with the map.
+    Hector(hector::Parameters),
 }
 
 /// A system that makes a map and a path of scans and odometry.
@@ -22,6 +25,8 @@ pub enum EngineParameters {
 pub enum Engine {
     /// A particle filter.
     GMapping(Box<GMapping>),
+    /// One hypothesis, by matching each scan with the map.
+    Hector(Box<Hector>),
 }
 
 /// A scan with what there is to use it.
@@ -45,6 +50,9 @@ impl Engine {
             EngineParameters::GMapping(parameters, seed) => {
                 Ok(Self::GMapping(Box::new(GMapping::new(parameters, seed, threads)?)))
             }
+            EngineParameters::Hector(parameters) => {
+                Ok(Self::Hector(Box::new(Hector::new(parameters))))
+            }
         }
     }
 
@@ -53,6 +61,7 @@ impl Engine {
     pub const fn needs_odometry(&self) -> bool {
         match self {
             Self::GMapping(_) => true,
+            Self::Hector(_) => false,
         }
     }
 
@@ -61,6 +70,7 @@ impl Engine {
     pub fn reset(&mut self, initial_pose: Option<Pose2>) {
         match self {
             Self::GMapping(filter) => filter.reset(initial_pose),
+            Self::Hector(hector) => hector.reset(initial_pose),
         }
     }
 
@@ -69,6 +79,7 @@ impl Engine {
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
         match self {
             Self::GMapping(filter) => filter.set_pose(pose_in_map),
+            Self::Hector(hector) => hector.set_pose(pose_in_map),
         }
     }
 
@@ -76,6 +87,7 @@ impl Engine {
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         match self {
             Self::GMapping(filter) => filter.add_odometry(odom_from_base),
+            Self::Hector(hector) => hector.add_odometry(odom_from_base),
         }
     }
 
@@ -87,6 +99,7 @@ impl Engine {
                 filter.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
             }
             (Self::GMapping(_), None) => ScanUpdate::Skipped(SkipReason::BadOdometry),
+            (Self::Hector(hector), _) => hector.add_scan(sweep, on_phase),
         }
     }
 
@@ -96,6 +109,7 @@ impl Engine {
     pub fn pose_in_map(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.pose_in_map(),
+            Self::Hector(hector) => hector.pose_in_map(),
         }
     }
 
@@ -105,6 +119,7 @@ impl Engine {
     pub fn map_from_odom(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.map_from_odom(),
+            Self::Hector(hector) => hector.map_from_odom(),
         }
     }
 
@@ -113,6 +128,7 @@ impl Engine {
     pub fn covariance(&self) -> Matrix3<f64> {
         match self {
             Self::GMapping(filter) => filter.cloud_covariance(),
+            Self::Hector(hector) => hector.covariance(),
         }
     }
 
@@ -121,6 +137,8 @@ impl Engine {
     pub fn hypotheses(&self) -> Vec<Pose2> {
         match self {
             Self::GMapping(filter) => filter.particles().iter().map(|p| p.pose_in_map()).collect(),
+            Self::Hector(hector) if hector.has_begun() => vec![hector.pose_in_map()],
+            Self::Hector(_) => Vec::new(),
         }
     }
 
@@ -129,6 +147,7 @@ impl Engine {
     pub fn has_begun(&self) -> bool {
         match self {
             Self::GMapping(filter) => !filter.particles().is_empty(),
+            Self::Hector(hector) => hector.has_begun(),
         }
     }
 
@@ -137,6 +156,7 @@ impl Engine {
     pub fn path(&self) -> Path {
         match self {
             Self::GMapping(filter) => filter.path(),
+            Self::Hector(hector) => hector.path().clone(),
         }
     }
 
@@ -144,6 +164,7 @@ impl Engine {
     pub fn occupancy(&mut self) -> &OccupancyMap {
         match self {
             Self::GMapping(filter) => filter.occupancy(),
+            Self::Hector(hector) => hector.occupancy(),
         }
     }
 
@@ -152,6 +173,7 @@ impl Engine {
     pub fn occupied_threshold(&self) -> f64 {
         match self {
             Self::GMapping(filter) => filter.occupied_threshold(),
+            Self::Hector(_) => hector::OCCUPIED_THRESHOLD,
         }
     }
 
@@ -175,6 +197,7 @@ impl Engine {
     pub fn tiles(&self) -> TileCounts {
         match self {
             Self::GMapping(filter) => filter.particle_tiles(),
+            Self::Hector(hector) => hector.tiles(),
         }
     }
 }

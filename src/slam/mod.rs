@@ -6,6 +6,7 @@
 pub mod engine;
 pub mod gmapping;
 pub mod grid;
+pub mod hector;
 pub mod motion_gate;
 pub mod odometry;
 pub mod path;

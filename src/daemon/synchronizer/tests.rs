@@ -15,6 +15,7 @@ fn settings() -> Settings {
         odometry_timeout: TIMEOUT,
         most_waiting: 4,
         source: OdometrySource::Auto,
+        need: Need::Required,
         odom_key: "robot01/odom".to_owned(),
         tf_path: "robot01/tf (from `odom` to `base_link`)".to_owned(),
     }
@@ -76,7 +77,8 @@ impl Rig {
     fn told(&mut self) -> Vec<String> {
         let told = |call| match call {
             Call::Odometry(_, pose) => format!("o{}", pose.x),
-            Call::Scan(ready) => format!("s{}", ready.odom_from_base.x),
+            Call::Scan(ReadyScan { odom_from_base: Some(pose), .. }) => format!("s{}", pose.x),
+            Call::Scan(_) => "s-".to_owned(),
             Call::Refuse(refusal) => {
                 let after = refusal.stamp.unwrap().seconds_since(stamp(0)) * 1e3;
                 format!("{:?}{after:.0}", refusal.verdict)
@@ -402,4 +404,41 @@ proptest! {
         ended += rig.told().iter().filter(|call| !call.starts_with('o')).count();
         prop_assert_eq!(ended, scans);
     }
+}
+
+#[test]
+fn where_odometry_is_optional_only_the_first_scan_waits_for_it() {
+    let mut rig = Rig::new(Settings { need: Need::Optional, ..settings() });
+    rig.scan(0);
+    rig.scan_from("base_link", 100, Duration::from_millis(100));
+    assert_eq!((rig.told().len(), rig.synchronizer.waiting()), (0, 2));
+    rig.expire(TIMEOUT);
+    assert_eq!(rig.told(), ["s-", "s-"]);
+    rig.scan(200);
+    assert_eq!((rig.told(), rig.synchronizer.waiting()), (vec!["s-".to_owned()], 0));
+}
+
+#[test]
+fn where_odometry_is_optional_it_is_used_as_soon_as_it_comes_and_missed_when_it_ends() {
+    let mut rig = Rig::new(Settings { need: Need::Optional, ..settings() });
+    rig.scan(0);
+    rig.expire(TIMEOUT);
+    rig.odometry(90);
+    rig.scan(100);
+    rig.odometry(110);
+    assert_eq!(rig.told(), ["s-", "o90", "s100"]);
+    rig.scan_from("base_link", 300, Duration::from_secs(1));
+    rig.expire(Duration::from_secs(1));
+    assert_eq!(rig.synchronizer.waiting(), 1);
+    rig.expire(Duration::from_secs(2));
+    assert_eq!(rig.told(), ["o110", "s-"]);
+}
+
+#[test]
+fn without_a_source_no_odometry_is_taken_and_no_scan_waits() {
+    let source = OdometrySource::None;
+    let mut rig = Rig::new(Settings { need: Need::Optional, source, ..settings() });
+    assert!(!rig.odometry_on(Channel::Messages, 0));
+    rig.scan(0);
+    assert_eq!(rig.told(), ["s-"]);
 }

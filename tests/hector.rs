@@ -1,0 +1,228 @@
+//! Laws of Hector's matching and of its maps, and what it makes of corridors and of no odometry.
+
+use gmapd::sim::lidar::Lidar;
+use gmapd::sim::{Place, Scenario, Simulation};
+use gmapd::slam::engine::Sweep;
+use gmapd::slam::grid::log_odds::{CLAMP, Evidence, LogOdds, LogOddsMap, Probabilities};
+use gmapd::slam::hector::gauss_newton::Level;
+use gmapd::slam::hector::matcher;
+use gmapd::slam::hector::prediction::Prediction;
+use gmapd::slam::hector::prepared_scan::{Directions, PreparedScan};
+use gmapd::slam::hector::pyramid::Pyramid;
+use gmapd::slam::hector::{Hector, Parameters};
+use gmapd::slam::pose::{Point2, Pose2, Stamp, wrap_angle};
+use gmapd::slam::scan::Scan;
+use gmapd::slam::update::{ScanReport, ScanUpdate};
+use nalgebra::{Matrix3, Vector3};
+use proptest::collection::vec;
+use proptest::prelude::{any, prop_assert, proptest};
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+#[expect(dead_code, reason = "other tests use the rest")]
+mod support;
+
+use support::{full_circle, room, route, shots};
+
+const CORNER: Point2 = Point2::new(0.0, 0.0);
+
+fn evidence() -> Evidence {
+    Evidence { free: LogOdds::of_probability(0.4), occupied: LogOdds::of_probability(0.9) }
+}
+
+proptest! {
+    #[test]
+    fn the_update_is_bayes_rule(occupied in vec(any::<bool>(), 0..60)) {
+        let table = Probabilities::default();
+        let (mut log_odds, mut odds) = (LogOdds::default(), 1.0_f64);
+        for hit in occupied {
+            let p = if hit { 0.9 } else { 0.4 };
+            log_odds = log_odds.and(if hit { evidence().occupied } else { evidence().free });
+            odds = (odds * p / (1.0 - p)).clamp((-CLAMP).exp(), CLAMP.exp());
+            let expected = odds / (1.0 + odds);
+            prop_assert!((f64::from(table.of(log_odds)) - expected).abs() < 2e-3);
+            prop_assert!((log_odds.nats() - odds.ln()).abs() < 0.01);
+        }
+    }
+
+    /// The occupancy is bilinear between centres of cells; there, derivatives are exact.
+    #[test]
+    fn analytic_gradients_are_numeric_ones(
+        column in 0..40_i32,
+        row in 0..40_i32,
+        fraction in [0.1..0.9_f64, 0.1..0.9_f64],
+        theta in -3.0..3.0_f64,
+        reach in 0.0..60.0_f64,
+    ) {
+        let (map, table) = (drawn_map(), Probabilities::default());
+        let (sin, cos) = theta.sin_cos();
+        // The point lies at a place that is not near the centre line of a cell, cells.
+        let at = [f64::from(column) + 0.5 + fraction[0], f64::from(row) + 0.5 + fraction[1]];
+        let pose = |x: f64, y: f64, theta: f64| Pose2::new(x * 0.05, y * 0.05, theta);
+        let base = [at[0] - cos * reach, at[1] - sin * reach];
+        let near = pose(base[0], base[1], theta);
+        let level = Level::new(&map, &table, vec![[reach as f32, 0.0]], (near, reach * 0.05));
+        let fit = level.fit(near);
+        let cost = |x, y, theta| level.fit(pose(x, y, theta)).cost;
+        let h = 0.02;
+        let turn = h / reach.max(1.0);
+        let numeric = Vector3::new(
+            (cost(base[0] + h, base[1], theta) - cost(base[0] - h, base[1], theta)) / (h * 0.1),
+            (cost(base[0], base[1] + h, theta) - cost(base[0], base[1] - h, theta)) / (h * 0.1),
+            (cost(base[0], base[1], theta + turn) - cost(base[0], base[1], theta - turn))
+                / (2.0 * turn),
+        );
+        let analytic = -2.0 * fit.descent;
+        for axis in 0..3 {
+            let scale = if axis == 2 { reach.max(1.0) } else { 20.0 };
+            let error = (analytic[axis] - numeric[axis]).abs() / scale;
+            prop_assert!(error < 2e-3, "{analytic} {numeric}");
+        }
+    }
+}
+
+/// A room whose walls are not along the axes, seen once.
+fn drawn_map() -> LogOddsMap {
+    let mut map = LogOddsMap::new(0.05);
+    let parameters = Parameters { min_range: 0.0, ..Parameters::default() };
+    let lidar = full_circle(720);
+    let ranges = (0..720).map(|i| 0.7 + 0.3 * (f64::from(i) * 0.05).sin() as f32).collect();
+    let scan = Scan { stamp: Stamp(0), geometry: lidar.geometry, ranges };
+    let scan = Directions::default().prepare(&scan, &lidar.mount, &parameters);
+    map.add(&scan.outline, Pose2::new(1.0, 1.0, 0.3), evidence(), |_| ());
+    map
+}
+
+fn gaussian(rng: &mut ChaCha8Rng) -> f64 {
+    let (u, v): (f64, f64) = (rng.random::<f64>().max(1e-12), rng.random());
+    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+}
+
+fn look(lidar: &Lidar, at: Pose2, parameters: &Parameters, rng: &mut ChaCha8Rng) -> PreparedScan {
+    let ranges = lidar.sweep(&room(CORNER), |_| at, 0.0, rng);
+    let scan = Scan { stamp: Stamp(0), geometry: lidar.geometry, ranges };
+    Directions::default().prepare(&scan, &lidar.mount, parameters)
+}
+
+/// The mean of the squared errors, normalized by the covariance, of 500 scans placed from guesses
+/// 10 cm and 0.1 rad off (one standard deviation each way), and how many ended near the truth.
+fn trials(parameters: &Parameters, noise: f64) -> (f64, u32) {
+    let lidar = Lidar { range_noise_std: noise, ..Lidar::full_circle(360).expect("beams") };
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut pyramid = Pyramid::new(parameters);
+    let (mut sum, mut near) = (0.0, 0);
+    for trial in 0..500 {
+        if trial % 25 == 0 {
+            pyramid = Pyramid::new(parameters);
+            for pose in route(CORNER) {
+                pyramid.add(&look(&lidar, pose, parameters, &mut rng), pose, |_| ());
+            }
+        }
+        let on_the_way = route(CORNER)[rng.random_range(0..24)];
+        let beside = [0.1, 0.1, 0.3].map(|deviation| deviation * gaussian(&mut rng));
+        let truth = on_the_way * Pose2::new(beside[0], beside[1], beside[2]);
+        let scan = look(&lidar, truth, parameters, &mut rng);
+        let [x, y, theta] = [(); 3].map(|()| 0.1 * gaussian(&mut rng));
+        let pose_in_map = Pose2::new(truth.x + x, truth.y + y, truth.theta + theta);
+        let prediction = Prediction { pose_in_map, covariance: Matrix3::identity() * 0.01 };
+        let placed = matcher::place(&pyramid, &scan, &prediction, 1.0);
+        let found = placed.pose_in_map;
+        let turned = wrap_angle(found.theta - truth.theta);
+        let error = Vector3::new(found.x - truth.x, found.y - truth.y, turned);
+        let information = placed.covariance.try_inverse().expect("it is positive");
+        sum += error.dot(&(information * error));
+        near += u32::from(error.xy().norm() < 0.05 && turned.abs() < 0.02);
+    }
+    (sum / 500.0, near)
+}
+
+#[test]
+fn displaced_scans_are_recovered_and_the_covariance_is_that_of_the_errors() {
+    // 95 % of such means of 500 with three degrees of freedom lie here.
+    let bounds = 2.785..3.215;
+    for (resolution, noise) in [(0.025, 0.01), (0.05, 0.03)] {
+        let parameters = Parameters { resolution, ..Parameters::default() };
+        let (mean, near) = trials(&parameters, noise);
+        println!("{resolution} m cells, {noise} m noise: mean {mean:.3}, {near} of 500");
+        assert!(near >= 498, "{near} of 500 are near the truth");
+        assert!(bounds.contains(&mean), "the mean is {mean}");
+    }
+}
+
+fn report(update: ScanUpdate) -> ScanReport {
+    match update {
+        ScanUpdate::Processed(report) => report,
+        ScanUpdate::Skipped(reason) => panic!("skipped: {reason:?}"),
+    }
+}
+
+/// Where the robot is believed and truly is at the far end of the corridor, and the reports of
+/// scans that see neither end.
+fn corridor(with_odometry: bool) -> (f64, f64, Vec<ScanReport>) {
+    let simulation = Simulation::new(&Scenario::new(Place::Corridor, 1)).expect("beams");
+    // Neither end is seen from more than 10 m away.
+    let mut hector = Hector::new(Parameters { max_range: 10.0, ..Parameters::default() });
+    let (mut far, mut believed, mut amid) = (0.0, 0.0, Vec::new());
+    for reading in simulation.readings() {
+        let odom_from_base = with_odometry.then_some(reading.odom_from_base);
+        let mount = &simulation.lidar.mount;
+        let sweep = Sweep { scan: &reading.scan, mount, odom_from_base };
+        let report = report(hector.add_scan(&sweep, &mut |_| ()));
+        let x = reading.world_from_base.x;
+        if (10.0..46.0).contains(&x) {
+            amid.push(report);
+        }
+        if x > far {
+            (far, believed) = (x, hector.pose_in_map().x);
+        }
+    }
+    (far, believed, amid)
+}
+
+#[test]
+fn along_a_plain_corridor_odometry_decides_and_the_direction_is_told() {
+    let (far, believed, amid) = corridor(true);
+    println!("{believed} m of {far} m");
+    assert!((believed - far).abs() < 0.01 * far, "{believed} m of {far} m");
+    for report in amid {
+        let weak = report.weak_direction.expect("the scan does not tell how far");
+        assert!(weak.x.abs() > 0.99, "{weak:?}");
+    }
+}
+
+#[test]
+fn without_odometry_the_corridors_direction_is_told_all_the_same() {
+    let (_, _, amid) = corridor(false);
+    assert!(amid.len() > 100 && amid.iter().all(|report| report.weak_direction.is_some()));
+}
+
+#[test]
+fn a_room_leaves_nothing_open_and_is_mapped_without_odometry() {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    hector.set_pose(route(CORNER)[0]);
+    for shot in shots(&room(CORNER), &lidar, &route(CORNER)) {
+        let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base: None };
+        let report = report(hector.add_scan(&sweep, &mut |_| ()));
+        assert_eq!(report.weak_direction, None);
+        let error = shot.odom_from_base.between(hector.pose_in_map());
+        assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{error:?}");
+    }
+}
+
+#[test]
+fn scans_enter_the_map_only_after_enough_motion_and_move_the_pose_before() {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    let registered: Vec<bool> = shots(&room(CORNER), &lidar, &route(CORNER)[..4])
+        .iter()
+        .map(|shot| {
+            let odom_from_base = Some(shot.odom_from_base);
+            let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base };
+            report(hector.add_scan(&sweep, &mut |_| ())).registered
+        })
+        .collect();
+    // The robot moves by 0.3 m from scan to scan, and 0.4 m is enough.
+    assert_eq!(registered, [true, false, true, false]);
+    assert_eq!(hector.path().len(), 4);
+}
