@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub use raw::{
-    EngineKind, Interop, Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, RosDistro,
+    EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher, OdometrySource, RawConfig, RosDistro,
     Smoothing,
 };
 pub use source::Origin;
@@ -22,8 +22,10 @@ use crate::slam::engine::EngineParameters;
 use crate::slam::gmapping::{
     MapParameters, MatcherKind, MatcherParameters, Parameters, WeightSmoothing, Weighting,
 };
+use crate::slam::known_poses::{self, MapExtent};
 use crate::slam::motion_gate::MotionGate;
 use crate::slam::odometry::{JumpGuard, JumpPolicy, MotionNoise};
+use crate::slam::outline::BeamLimits;
 use crate::slam::pose::Pose2;
 use crate::slam::scan::{LaserMount, MountOrientation};
 use source::Entries;
@@ -63,6 +65,25 @@ impl Config {
     pub fn engine_parameters(&self) -> EngineParameters {
         match self.raw.engine {
             EngineKind::Gmapping => EngineParameters::GMapping(self.parameters(), self.raw.seed),
+            EngineKind::KnownPoses => EngineParameters::KnownPoses(self.known_poses()),
+        }
+    }
+
+    fn known_poses(&self) -> known_poses::Parameters {
+        let raw = &self.raw;
+        known_poses::Parameters {
+            resolution: raw.resolution,
+            limits: BeamLimits {
+                max_range: raw.max_range,
+                max_usable_range: raw.max_usable_range,
+                free_on_no_return: raw.free_on_no_return,
+                furthest: known_poses::FURTHEST_CELL * raw.resolution,
+            },
+            extent: match raw.map_of {
+                MapOf::AllScans => MapExtent::AllScans,
+                MapOf::NewestScan => MapExtent::NewestScan,
+            },
+            occupied_threshold: raw.occupied_threshold,
         }
     }
 

@@ -13,6 +13,8 @@ use crate::slam::gmapping::Parameters;
 pub struct RawConfig {
     /// Which system maps.
     pub engine: EngineKind,
+    /// Known poses: what the map is of.
+    pub map_of: MapOf,
     /// Number of hypotheses.
     pub particles: usize,
     /// Every n-th scan is looked at.
@@ -172,6 +174,7 @@ impl Default for RawConfig {
         let core = Parameters::default();
         Self {
             engine: EngineKind::Gmapping,
+            map_of: MapOf::AllScans,
             particles: core.particles,
             throttle_scans: core.throttle_scans,
             base_frame: "base_link".to_owned(),
@@ -239,6 +242,18 @@ impl Default for RawConfig {
 pub enum EngineKind {
     /// A particle filter.
     Gmapping,
+    /// Mapping along poses that somebody else knows.
+    KnownPoses,
+}
+
+/// What the map along known poses is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MapOf {
+    /// All scans since the beginning.
+    AllScans,
+    /// The newest scan alone.
+    NewestScan,
 }
 
 /// How the laser sits on the robot.

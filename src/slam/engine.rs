@@ -5,6 +5,7 @@ use nalgebra::Matrix3;
 use super::gmapping::{GMapping, Parameters, ThreadsError};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
+use super::known_poses::{self, KnownPoses};
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
@@ -15,6 +16,8 @@ use super::update::{OdometryUpdate, Phase, ScanReading, ScanUpdate, SkipReason};
 pub enum EngineParameters {
     /// A particle filter, with the seed of its random numbers.
     GMapping(Parameters, u64),
+    /// Mapping along given poses.
+    KnownPoses(known_poses::Parameters),
 }
 
 /// A system that makes a map and a path of scans and odometry.
@@ -22,6 +25,8 @@ pub enum EngineParameters {
 pub enum Engine {
     /// A particle filter.
     GMapping(Box<GMapping>),
+    /// Mapping along given poses, which come in place of odometry: `odom` is `map`.
+    KnownPoses(Box<KnownPoses>),
 }
 
 /// A scan with what there is to use it.
@@ -45,6 +50,9 @@ impl Engine {
             EngineParameters::GMapping(parameters, seed) => {
                 Ok(Self::GMapping(Box::new(GMapping::new(parameters, seed, threads)?)))
             }
+            EngineParameters::KnownPoses(parameters) => {
+                Ok(Self::KnownPoses(Box::new(KnownPoses::new(parameters))))
+            }
         }
     }
 
@@ -52,7 +60,7 @@ impl Engine {
     #[must_use]
     pub const fn needs_odometry(&self) -> bool {
         match self {
-            Self::GMapping(_) => true,
+            Self::GMapping(_) | Self::KnownPoses(_) => true,
         }
     }
 
@@ -61,14 +69,16 @@ impl Engine {
     pub fn reset(&mut self, initial_pose: Option<Pose2>) {
         match self {
             Self::GMapping(filter) => filter.reset(initial_pose),
+            Self::KnownPoses(mapping) => mapping.reset(),
         }
     }
 
     /// Says where the base is in `map`: before the first scan, where the map begins; later, the
-    /// robot is moved, and the map stays where it is.
+    /// robot is moved, and the map stays where it is. Where poses are given, this has no effect.
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
         match self {
             Self::GMapping(filter) => filter.set_pose(pose_in_map),
+            Self::KnownPoses(_) => {}
         }
     }
 
@@ -76,6 +86,7 @@ impl Engine {
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         match self {
             Self::GMapping(filter) => filter.add_odometry(odom_from_base),
+            Self::KnownPoses(mapping) => mapping.add_pose(odom_from_base),
         }
     }
 
@@ -86,7 +97,12 @@ impl Engine {
             (Self::GMapping(filter), Some(odom_from_base)) => {
                 filter.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
             }
-            (Self::GMapping(_), None) => ScanUpdate::Skipped(SkipReason::BadOdometry),
+            (Self::KnownPoses(mapping), Some(odom_from_base)) => {
+                mapping.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
+            }
+            (Self::GMapping(_) | Self::KnownPoses(_), None) => {
+                ScanUpdate::Skipped(SkipReason::BadOdometry)
+            }
         }
     }
 
@@ -96,6 +112,7 @@ impl Engine {
     pub fn pose_in_map(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.pose_in_map(),
+            Self::KnownPoses(mapping) => mapping.pose_in_map(),
         }
     }
 
@@ -105,6 +122,7 @@ impl Engine {
     pub fn map_from_odom(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.map_from_odom(),
+            Self::KnownPoses(_) => Pose2::IDENTITY,
         }
     }
 
@@ -113,6 +131,7 @@ impl Engine {
     pub fn covariance(&self) -> Matrix3<f64> {
         match self {
             Self::GMapping(filter) => filter.cloud_covariance(),
+            Self::KnownPoses(_) => Matrix3::zeros(),
         }
     }
 
@@ -121,6 +140,8 @@ impl Engine {
     pub fn hypotheses(&self) -> Vec<Pose2> {
         match self {
             Self::GMapping(filter) => filter.particles().iter().map(|p| p.pose_in_map()).collect(),
+            Self::KnownPoses(mapping) if mapping.path().is_empty() => Vec::new(),
+            Self::KnownPoses(mapping) => vec![mapping.pose_in_map()],
         }
     }
 
@@ -129,6 +150,7 @@ impl Engine {
     pub fn has_begun(&self) -> bool {
         match self {
             Self::GMapping(filter) => !filter.particles().is_empty(),
+            Self::KnownPoses(mapping) => !mapping.path().is_empty(),
         }
     }
 
@@ -137,6 +159,7 @@ impl Engine {
     pub fn path(&self) -> Path {
         match self {
             Self::GMapping(filter) => filter.path(),
+            Self::KnownPoses(mapping) => mapping.path().clone(),
         }
     }
 
@@ -144,6 +167,7 @@ impl Engine {
     pub fn occupancy(&mut self) -> &OccupancyMap {
         match self {
             Self::GMapping(filter) => filter.occupancy(),
+            Self::KnownPoses(mapping) => mapping.occupancy(),
         }
     }
 
@@ -152,6 +176,7 @@ impl Engine {
     pub fn occupied_threshold(&self) -> f64 {
         match self {
             Self::GMapping(filter) => filter.occupied_threshold(),
+            Self::KnownPoses(mapping) => mapping.occupied_threshold(),
         }
     }
 
@@ -167,6 +192,7 @@ impl Engine {
     pub fn tiles(&self) -> TileCounts {
         match self {
             Self::GMapping(filter) => filter.particle_tiles(),
+            Self::KnownPoses(_) => TileCounts::default(),
         }
     }
 }

@@ -6,8 +6,10 @@
 pub mod engine;
 pub mod gmapping;
 pub mod grid;
+pub mod known_poses;
 pub mod motion_gate;
 pub mod odometry;
+pub mod outline;
 pub mod path;
 pub mod pose;
 pub mod scan;
