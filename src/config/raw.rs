@@ -61,6 +61,9 @@ pub struct RawConfig {
     /// Readings above are not matched and free space ends there, m; left out, `maxRange`.
     #[serde(rename = "maxUrange")]
     pub max_usable_range: Option<f64>,
+    /// Seconds from the first beam of a sweep to the last; left out, as the scans say; 0, all at
+    /// once.
+    pub sweep_time_s: Option<f64>,
     /// Beams passed over between two that are matched.
     #[serde(rename = "lskip")]
     pub beam_skip: usize,
@@ -175,6 +178,7 @@ impl Default for RawConfig {
         Self {
             engine: EngineKind::Gmapping,
             map_of: MapOf::AllScans,
+            sweep_time_s: None,
             particles: core.particles,
             throttle_scans: core.throttle_scans,
             base_frame: "base_link".to_owned(),

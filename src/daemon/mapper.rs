@@ -467,6 +467,7 @@ fn synchronizer(config: &Config, keys: &InputKeys) -> Synchronizer {
     Synchronizer::new(synchronizer::Settings {
         odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
         most_waiting: raw.scan_queue,
+        sweep_time_s: raw.sweep_time_s,
         source: raw.odometry_source,
         odom_key: keys.of(Input::Odom).to_string(),
         tf_path: format!(

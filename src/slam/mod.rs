@@ -3,6 +3,7 @@
 //! Stamps and odometry come in as values, randomness from a seed and counters, so the same input
 //! gives the same bytes on any machine and any number of threads.
 
+pub mod deskew;
 pub mod engine;
 pub mod gmapping;
 pub mod grid;

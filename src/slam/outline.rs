@@ -17,7 +17,10 @@ pub struct BeamLimits {
     pub furthest: f64,
 }
 
-/// Where the beams end in the base frame.
+/// Where the beams end in the frame of the base at the scan's stamp.
+///
+/// The free space of all beams is seen from where the first was taken: within a sweep a robot
+/// moves by less than a few cells, and free space ends at the obstacles either way.
 ///
 /// As in slam_gmapping, readings above `maxRange` say nothing, and readings between `maxUrange`
 /// and `maxRange` make free space up to `maxUrange`. Beams without return make none where neither
@@ -38,7 +41,7 @@ pub fn outline(scan: &Scan, mount: &LaserMount, limits: &BeamLimits) -> ScanOutl
             Beam::NoReturn if free_on_no_return => (usable, BeamEndKind::Free),
             Beam::Hit(_) | Beam::NoReturn | Beam::Invalid => (0.0, BeamEndKind::Nothing),
         };
-        let Point2 { x, y } = mount.point_in_base(geometry.angle(index), range);
+        let Point2 { x, y } = scan.point_in_base(mount, index, range);
         BeamEnd { point: [x as f32, y as f32], kind }
     };
     ScanOutline {
