@@ -21,7 +21,7 @@ use crate::convert;
 use crate::daemon::frames::{FrameNames, Frames};
 use crate::daemon::ledger::Verdict;
 use crate::daemon::synchronizer::{
-    self, Call, Channel, FramedScan, ReadyScan, Refusal, Synchronizer,
+    self, Call, Channel, FramedScan, Need, ReadyScan, Refusal, Synchronizer,
 };
 use crate::logs::recording::{Kind, Message, Messages, RawMessage, Recording, RecordingError};
 use crate::logs::{Fault, LogStatistics, Reading};
@@ -124,6 +124,7 @@ impl Recorded {
             most_waiting: raw.scan_queue,
             sweep_time_s: raw.sweep_time_s,
             source: self.topics.source,
+            need: Need::Required,
             odom_key,
             tf_path: format!("{} (from `{odom}` to `{base}`)", transforms.join(", ")),
         });
@@ -200,6 +201,8 @@ impl Readings {
             }
             Call::Scan(ReadyScan { scan, mount, odom_from_base }) => {
                 let stamp = scan.stamp;
+                // None only if the configuration wants none, and then nobody looks at it.
+                let odom_from_base = odom_from_base.unwrap_or_default();
                 // The odometry of a scan comes with it, and once is enough.
                 self.odometry.take_if(|odometry| *odometry == (stamp, odom_from_base));
                 self.give_odometry();

@@ -15,7 +15,7 @@ pub use summary::{
 };
 
 use crate::clock::{Elapsed, Stopwatch};
-use crate::config::Config;
+use crate::config::{Config, OdometrySource};
 use crate::convert::{self, OdometrySample};
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
@@ -31,6 +31,9 @@ use crate::slam::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipRea
 #[derive(Debug)]
 pub struct Replay {
     engine: Engine,
+    /// What odometry says is kept from the engine if the configuration wants none.
+    source: OdometrySource,
+    weak: u64,
     mount: Option<LaserMount>,
     track: Track,
     counts: Counts,
@@ -47,6 +50,8 @@ impl Replay {
     pub fn new(config: &Config, threads: usize) -> Result<Self, ThreadsError> {
         Ok(Self {
             engine: Engine::new(config.engine_parameters(), threads)?,
+            source: config.raw.odometry_source,
+            weak: 0,
             mount: config.laser_mount(),
             track: Track::default(),
             counts: Counts::default(),
@@ -107,20 +112,27 @@ impl Replay {
             counts: self.counts,
             sample_sizes: self.sample_sizes,
             resamples: self.resamples,
+            weak: self.weak,
             times: self.times,
         }
     }
 
     /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
     fn add_odometry(&mut self, stamp: Stamp, odom_from_base: Pose2) -> OdometryUpdate {
-        let step = self.engine.add_odometry(odom_from_base);
+        let step = match self.source {
+            OdometrySource::None if odom_from_base.is_finite() => OdometryUpdate::Accepted,
+            OdometrySource::None => OdometryUpdate::NotUsable,
+            _ => self.engine.add_odometry(odom_from_base),
+        };
         self.track.add(stamp, odom_from_base, step);
         step
     }
 
     fn add_scan(&mut self, scan: &Scan, mount: &LaserMount, odom_from_base: Pose2) -> Verdict {
         let mount = &self.mount.unwrap_or(*mount);
-        let sweep = Sweep { scan, mount, odom_from_base: Some(odom_from_base) };
+        let wanted = self.source != OdometrySource::None;
+        let odom_from_base = wanted.then_some(odom_from_base);
+        let sweep = Sweep { scan, mount, odom_from_base };
         let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();
         let mut phase_watch = total;
@@ -145,6 +157,7 @@ impl Replay {
     fn add_report(&mut self, report: &ScanReport) {
         self.sample_sizes.push(report.effective_sample_size);
         self.resamples += u64::from(report.resampled);
+        self.weak += u64::from(report.weak_direction.is_some());
     }
 }
 
@@ -188,6 +201,8 @@ pub struct Outcome {
     pub sample_sizes: Vec<f64>,
     /// How often particles were drawn anew.
     pub resamples: u64,
+    /// Processed scans that left a direction open, where the engine looks for it.
+    pub weak: u64,
     /// What processed scans took.
     pub times: ScanTimes,
 }

@@ -8,10 +8,11 @@ use gmapd::sim::{Place, Scenario, Simulation};
 use gmapd::slam::engine::{Engine, Sweep};
 use gmapd::slam::grid::Cell;
 use gmapd::slam::grid::occupancy::OccupancyGrid;
-use gmapd::slam::pose::{Point2, Pose2};
+use gmapd::slam::pose::{Point2, Pose2, Stamp};
 use gmapd::slam::scan::{LaserMount, Scan};
 use gmapd::slam::update::{ScanUpdate, SkipReason};
 
+#[expect(dead_code, reason = "what is for the particle filter is not used here")]
 mod support;
 
 use support::{Shot, full_circle, room, route, shots};
@@ -176,4 +177,51 @@ fn a_scan_without_an_obstacle_frees_what_it_saw() {
     let grid = engine.occupancy_grid().expect("something is known");
     let area = cells(&grid, 0).len() as f64 * 0.05 * 0.05;
     assert!((area - 25.0 * std::f64::consts::PI).abs() < 0.5, "{area} m²");
+}
+
+/// Of the edge cases of the semantics (B5), those about the beams.
+#[test]
+fn any_beams_are_taken_as_they_are() {
+    let shot = drive().remove(0);
+    let mut engine = engine(&[]);
+    let ranges = |count| Scan { ranges: vec![2.0; count], ..shot.scan.clone() };
+    for (processed, count) in (1..).zip([360, 1, 2, 361, 3000, 359]) {
+        let update = add(&mut engine, &ranges(count), shot.odom_from_base);
+        assert!(matches!(update, ScanUpdate::Processed(_)), "{count} beams: {update:?}");
+        assert_eq!(engine.path().len(), processed);
+    }
+    let mut odd = ranges(360);
+    odd.ranges[..6].copy_from_slice(&[0.0, -1.0, f32::NAN, f32::NEG_INFINITY, 0.05, f32::INFINITY]);
+    let update = add(&mut engine, &odd, shot.odom_from_base);
+    let ScanUpdate::Processed(report) = update else { panic!("{update:?}") };
+    assert_eq!(report.hits, 354);
+    let none = add(&mut engine, &ranges(0), shot.odom_from_base);
+    assert_eq!(none, ScanUpdate::Skipped(SkipReason::NoUsableBeams));
+}
+
+/// Stamps that step back and repeat are no concern of a map along given poses, and the same input
+/// gives the same map.
+#[test]
+fn the_order_of_scans_counts_and_not_their_stamps() {
+    let drive = drive();
+    let mapped = |stamp: fn(usize) -> i64| {
+        let mut engine = engine(&[]);
+        for (index, shot) in drive.iter().enumerate() {
+            let scan = Scan { stamp: Stamp(stamp(index)), ..shot.scan.clone() };
+            add(&mut engine, &scan, shot.odom_from_base);
+        }
+        engine.occupancy_grid()
+    };
+    assert_eq!(mapped(|index| index as i64), mapped(|index| -(index as i64) / 2));
+}
+
+#[test]
+fn a_reset_forgets_the_map_and_a_set_pose_moves_nothing() {
+    let shot = drive().remove(0);
+    let mut engine = engine(&[]);
+    add(&mut engine, &shot.scan, shot.odom_from_base);
+    engine.set_pose(Pose2::new(9.0, 9.0, 9.0));
+    assert_eq!(engine.pose_in_map(), shot.odom_from_base);
+    engine.reset(None);
+    assert!(!engine.has_begun() && engine.occupancy_grid().is_none());
 }

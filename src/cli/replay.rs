@@ -83,7 +83,12 @@ pub(crate) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let config = load_config(arguments)?;
-    let log = Log::open(&arguments.log, &arguments.topics, &config)?;
+    // Where a file gives poses, the log's odometry is odometry.
+    let of_log = match arguments.poses {
+        Some(_) => config.clone(),
+        None => config.with_poses_as_odometry(),
+    };
+    let log = Log::open(&arguments.log, &arguments.topics, &of_log)?;
     log.warn(&arguments.log);
     if let Some(directory) = &arguments.out {
         std::fs::create_dir_all(directory)
@@ -205,7 +210,7 @@ fn along_given_poses(
                     }
                     Err(missing) if reading.scan.is_some() => {
                         let (stamp, detail) = (Some(reading.stamp), missing.to_string());
-                        let refusal = Refusal { stamp, verdict: Verdict::NoPose, detail };
+                        let refusal = Refusal { stamp, verdict: Verdict::NoOdometry, detail };
                         refuse(&mut replay, &mut refusals, refusal);
                     }
                     Err(_) => {}

@@ -5,7 +5,7 @@ use std::fmt;
 use serde_json::{Map, Value};
 
 use super::ConfigError;
-use super::raw::RawConfig;
+use super::raw::{EngineKind, OdometrySource, RawConfig};
 use super::source::{Entries, Origin};
 
 /// A name this similar to an unknown one is suggested (Jaro-Winkler, 1 is equal).
@@ -28,7 +28,22 @@ pub(super) fn resolve(entries: &Entries) -> Result<RawConfig, ConfigError> {
             return Err(out_of_range(entries, key, value.to_string(), allowed.to_string()));
         }
     }
+    check_together(entries, &raw)?;
     Ok(raw)
+}
+
+/// Values that are allowed alone, and not together.
+fn check_together(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError> {
+    if raw.engine == EngineKind::Gmapping && raw.odometry_source == OdometrySource::None {
+        let key = "odometry_source";
+        return Err(wrong_kind(entries, key, "GMapping cannot do without odometry; Hector can"));
+    }
+    if raw.laser_max_dist <= raw.laser_min_dist {
+        let (key, value) = ("laser_max_dist", raw.laser_max_dist.to_string());
+        let allowed = format!("more than laser_min_dist, which is {}", raw.laser_min_dist);
+        return Err(out_of_range(entries, key, value, allowed));
+    }
+    Ok(())
 }
 
 fn check_keys(entries: &Entries) -> Result<(), ConfigError> {
@@ -161,6 +176,14 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("resampleThreshold", raw.resample_threshold, Between(0.0, 1.0)),
         ("jump_max_step_m", raw.jump_max_step_m, Positive),
         ("delta", raw.resolution, Between(0.001, 10.0)),
+        ("map_resolution", raw.map_resolution, Between(0.001, 10.0)),
+        ("map_multi_res_levels", raw.map_multi_res_levels as f64, Between(1.0, 10.0)),
+        ("update_factor_free", raw.update_factor_free, Between(0.001, 0.499)),
+        ("update_factor_occupied", raw.update_factor_occupied, Between(0.501, 0.999)),
+        ("map_update_distance_thresh", raw.map_update_distance_thresh, AtLeast(0.0)),
+        ("map_update_angle_thresh", raw.map_update_angle_thresh, AtLeast(0.0)),
+        ("laser_min_dist", raw.laser_min_dist, AtLeast(0.0)),
+        ("laser_max_dist", raw.laser_max_dist, Positive),
         ("occ_thresh", raw.occupied_threshold, Between(0.0, 1.0)),
         ("odometry_timeout_s", raw.odometry_timeout_s, Between(0.01, 5.0)),
         ("scan_queue", raw.scan_queue as f64, Between(1.0, 1000.0)),

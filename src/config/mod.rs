@@ -22,6 +22,7 @@ use crate::slam::engine::EngineParameters;
 use crate::slam::gmapping::{
     MapParameters, MatcherKind, MatcherParameters, Parameters, WeightSmoothing, Weighting,
 };
+use crate::slam::hector;
 use crate::slam::known_poses::{self, MapExtent};
 use crate::slam::motion_gate::MotionGate;
 use crate::slam::odometry::{JumpGuard, JumpPolicy, MotionNoise};
@@ -65,6 +66,7 @@ impl Config {
     pub fn engine_parameters(&self) -> EngineParameters {
         match self.raw.engine {
             EngineKind::Gmapping => EngineParameters::GMapping(self.parameters(), self.raw.seed),
+            EngineKind::Hector => EngineParameters::Hector(self.hector_parameters()),
             EngineKind::KnownPoses => EngineParameters::KnownPoses(self.known_poses()),
         }
     }
@@ -84,6 +86,29 @@ impl Config {
                 MapOf::NewestScan => MapExtent::NewestScan,
             },
             occupied_threshold: raw.occupied_threshold,
+        }
+    }
+
+    /// What Hector is told. Keys that it shares with GMapping mean the same to both.
+    #[must_use]
+    pub fn hector_parameters(&self) -> hector::Parameters {
+        let raw = &self.raw;
+        let Parameters { throttle_scans, initial_pose, motion_noise, jump, map, .. } =
+            self.parameters();
+        hector::Parameters {
+            throttle_scans,
+            resolution: raw.map_resolution,
+            levels: raw.map_multi_res_levels,
+            free_probability: raw.update_factor_free,
+            occupied_probability: raw.update_factor_occupied,
+            update_distance: raw.map_update_distance_thresh,
+            update_angle: raw.map_update_angle_thresh,
+            min_range: raw.laser_min_dist,
+            max_range: raw.laser_max_dist,
+            free_on_no_return: map.free_on_no_return,
+            initial_pose,
+            motion_noise,
+            jump,
         }
     }
 
@@ -121,6 +146,23 @@ impl Config {
                 free_on_no_return: raw.free_on_no_return,
             },
         }
+    }
+
+    /// The same for an engine that is given poses: what other engines have as odometry, `odom_frame`
+    /// to `base_frame`, are then the transforms from `map_frame`, and poses may jump.
+    ///
+    /// Messages of odometry are poses in `map` only where `odometry_source: odom` says so.
+    #[must_use]
+    pub fn with_poses_as_odometry(&self) -> Self {
+        let mut config = self.clone();
+        if config.raw.engine == EngineKind::KnownPoses {
+            config.raw.odom_frame.clone_from(&self.raw.map_frame);
+            config.raw.jump_policy = Jump::Continue;
+            if config.raw.odometry_source == OdometrySource::Auto {
+                config.raw.odometry_source = OdometrySource::Tf;
+            }
+        }
+        config
     }
 
     /// How the laser sits on the robot, where the configuration says so.
@@ -181,7 +223,9 @@ impl From<Jump> for JumpPolicy {
 
 fn warnings_about(entries: &Entries, raw: &RawConfig) -> Vec<ConfigWarning> {
     let without_effect = |key: &str| {
-        if raw::DEAD_KEYS.contains(&key) {
+        if let Some(warning) = of_another_engine(key, raw.engine) {
+            Some(warning)
+        } else if raw::DEAD_KEYS.contains(&key) {
             Some(ConfigWarning::NeverHadAnEffect { key: key.to_owned() })
         } else if raw::EXTENT_KEYS.contains(&key) {
             Some(ConfigWarning::MapGrows { key: key.to_owned() })
@@ -192,6 +236,18 @@ fn warnings_about(entries: &Entries, raw: &RawConfig) -> Vec<ConfigWarning> {
         }
     };
     entries.keys().filter_map(|key| without_effect(key)).collect()
+}
+
+fn of_another_engine(key: &str, engine: EngineKind) -> Option<ConfigWarning> {
+    let (of, instead) = match engine {
+        EngineKind::Gmapping => (raw::HECTOR_ONLY.contains(&key).then_some("hector")?, None),
+        EngineKind::Hector => {
+            let (_, instead) = raw::GMAPPING_ONLY.iter().find(|(name, _)| *name == key)?;
+            ("gmapping", Some(*instead))
+        }
+        EngineKind::KnownPoses => (raw::HECTOR_ONLY.contains(&key).then_some("hector")?, None),
+    };
+    Some(ConfigWarning::OtherEngine { key: key.to_owned(), of, instead })
 }
 
 /// What an operator should know about a configuration that is valid.
@@ -211,6 +267,22 @@ pub enum ConfigWarning {
     CompatOnly {
         /// The key.
         key: String,
+    },
+    /// A parameter of an engine that does not run.
+    OtherEngine {
+        /// The key.
+        key: String,
+        /// The engine that looks at it.
+        of: &'static str,
+        /// What the engine that runs has in its place.
+        instead: Option<&'static str>,
+    },
+    /// A parameter of hector_mapping that means nothing here.
+    Hectors {
+        /// The key.
+        key: String,
+        /// What there is in its place.
+        instead: &'static str,
     },
     /// A parameter of ROS, or of a slam_gmapping of long ago.
     Foreign {
@@ -236,14 +308,23 @@ impl fmt::Display for ConfigWarning {
             Self::CompatOnly { key } => {
                 write!(formatter, "{key} has an effect only with \"matcher: compat\"")
             }
+            Self::OtherEngine { key, of, instead: None } => {
+                write!(formatter, "{key} has an effect only with \"engine: {of}\"")
+            }
+            Self::OtherEngine { key, of, instead: Some(instead) } => {
+                write!(
+                    formatter,
+                    "{key} has an effect only with \"engine: {of}\"; here it is {instead}"
+                )
+            }
+            Self::Hectors { key, instead } => {
+                write!(formatter, "{key} of hector_mapping has no effect: {instead}")
+            }
             Self::Foreign { key } => {
                 write!(formatter, "{key} has no effect: it is not a parameter of the filter")
             }
             Self::OtherNode { name } => {
-                write!(
-                    formatter,
-                    "{name} is passed over: it is not among slam_gmapping's parameters"
-                )
+                write!(formatter, "{name} is passed over: it is not among the engine's parameters")
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::gmapping::Parameters;
+use crate::slam::{gmapping::Parameters, hector};
 
 /// All keys of the file. A key that is left out has slam_gmapping's default.
 ///
@@ -144,6 +144,23 @@ pub struct RawConfig {
     /// Whether a beam without return marks free space out to `maxUrange`.
     pub free_on_no_return: bool,
 
+    /// Hector: metres a cell of the finest map.
+    pub map_resolution: f64,
+    /// Hector: how many maps, each with cells twice as large as the one before.
+    pub map_multi_res_levels: usize,
+    /// Hector: how likely a cell that a beam passed is occupied.
+    pub update_factor_free: f64,
+    /// Hector: how likely a cell that a beam ended in is occupied.
+    pub update_factor_occupied: f64,
+    /// Hector: metres after which a scan enters the map.
+    pub map_update_distance_thresh: f64,
+    /// Hector: radians after which a scan enters the map.
+    pub map_update_angle_thresh: f64,
+    /// Hector: shorter readings say nothing, m.
+    pub laser_min_dist: f64,
+    /// Hector: longer readings are not matched, and free space ends there, m.
+    pub laser_max_dist: f64,
+
     /// Without effect: the map grows without limit.
     pub xmin: f64,
     /// Without effect: the map grows without limit.
@@ -166,6 +183,58 @@ pub struct RawConfig {
 pub(super) const DEAD_KEYS: [&str; 4] =
     ["llsamplerange", "llsamplestep", "lasamplerange", "lasamplestep"];
 
+/// Keys of hector_mapping that mean nothing here, and what takes their place.
+pub(super) const HECTOR_KEYS: [(&str, &str); 27] = [
+    ("map_size", "the map grows without limit"),
+    ("map_start_x", "the map grows without limit"),
+    ("map_start_y", "the map grows without limit"),
+    ("laser_z_min_value", "a laser that is not level is refused"),
+    ("laser_z_max_value", "a laser that is not level is refused"),
+    ("pub_drawings", "nothing is drawn"),
+    ("pub_debug_output", "there is no such output"),
+    ("pub_map_odom_transform", "transform_publish_period: 0 turns it off"),
+    ("pub_map_scanmatch_transform", "there is no such frame"),
+    ("tf_map_scanmatch_transform_frame_name", "there is no such frame"),
+    ("pub_odometry", "the pose is published"),
+    ("advertise_map_service", "the map is always answered"),
+    ("scan_subscriber_queue_size", "scan_queue takes its place"),
+    ("scan_topic", "keys takes its place"),
+    ("sys_msg_topic", "slam/cmd/reset takes its place"),
+    ("pose_update_topic", "the pose is published on slam/pose"),
+    ("use_tf_scan_transformation", "the laser's mount is always used"),
+    ("use_tf_pose_start_estimate", "odometry is used where there is some"),
+    ("map_with_known_poses", "it is an engine of its own"),
+    ("output_timing", "the status tells it"),
+    ("map_pub_period", "map_update_interval takes its place"),
+    ("trajectory_update_rate", "the path has each scan"),
+    ("trajectory_publish_rate", "the path is published with the map"),
+    ("target_frame_name", "map_frame takes its place"),
+    ("source_frame_name", "base_frame takes its place"),
+    ("tf_prefix", "prefix takes its place"),
+    ("advertise_map_topic", "the map is always published"),
+];
+
+/// Keys of Hector, which GMapping does not look at.
+pub(super) const HECTOR_ONLY: [&str; 8] = [
+    "map_resolution",
+    "map_multi_res_levels",
+    "update_factor_free",
+    "update_factor_occupied",
+    "map_update_distance_thresh",
+    "map_update_angle_thresh",
+    "laser_min_dist",
+    "laser_max_dist",
+];
+
+/// Keys of GMapping that have another name and another default with Hector.
+pub(super) const GMAPPING_ONLY: [(&str, &str); 5] = [
+    ("linearUpdate", "map_update_distance_thresh"),
+    ("angularUpdate", "map_update_angle_thresh"),
+    ("maxRange", "laser_max_dist"),
+    ("maxUrange", "laser_max_dist"),
+    ("delta", "map_resolution"),
+];
+
 /// Keys that size the original's first map.
 pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
 
@@ -175,6 +244,7 @@ pub(super) const COMPAT_KEYS: [&str; 4] = ["sigma", "kernelSize", "lsigma", "ite
 impl Default for RawConfig {
     fn default() -> Self {
         let core = Parameters::default();
+        let hector = hector::Parameters::default();
         Self {
             engine: EngineKind::Gmapping,
             map_of: MapOf::AllScans,
@@ -228,6 +298,14 @@ impl Default for RawConfig {
             resolution: core.resolution,
             occupied_threshold: core.map.occupied_threshold,
             free_on_no_return: core.map.free_on_no_return,
+            map_resolution: hector.resolution,
+            map_multi_res_levels: hector.levels,
+            update_factor_free: hector.free_probability,
+            update_factor_occupied: hector.occupied_probability,
+            map_update_distance_thresh: hector.update_distance,
+            map_update_angle_thresh: hector.update_angle,
+            laser_min_dist: hector.min_range,
+            laser_max_dist: hector.max_range,
             xmin: -100.0,
             ymin: -100.0,
             xmax: 100.0,
@@ -246,6 +324,8 @@ impl Default for RawConfig {
 pub enum EngineKind {
     /// A particle filter.
     Gmapping,
+    /// One hypothesis, by matching each scan with the map.
+    Hector,
     /// Mapping along poses that somebody else knows.
     KnownPoses,
 }
@@ -331,6 +411,8 @@ pub enum OdometrySource {
     Odom,
     /// Transforms from `odom_frame` to `base_frame`.
     Tf,
+    /// Nowhere: the engine has to do without.
+    None,
 }
 
 /// Which scan matcher runs.

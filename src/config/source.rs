@@ -9,10 +9,12 @@ use serde_json::Value;
 use serde_saphyr::Spanned;
 use serde_saphyr::options::DuplicateKeyPolicy;
 
+use super::raw::HECTOR_KEYS;
 use super::{ConfigError, ConfigWarning};
 
-/// The names under which ROS nests the parameters of slam_gmapping.
-const NODE_NAMES: [&str; 3] = ["slam_gmapping", "/slam_gmapping", "/**"];
+/// The names under which ROS nests the parameters of slam_gmapping and hector_mapping.
+const NODE_NAMES: [&str; 5] =
+    ["slam_gmapping", "/slam_gmapping", "hector_mapping", "/hector_mapping", "/**"];
 
 /// ROS 2 nests them once more.
 const ROS_PARAMETERS: &str = "ros__parameters";
@@ -71,6 +73,10 @@ pub(super) fn add_file(
     for (key, node) in parameters {
         if FOREIGN_KEYS.contains(&key.as_str()) {
             warnings.push(ConfigWarning::Foreign { key });
+            continue;
+        }
+        if let Some((_, instead)) = HECTOR_KEYS.iter().find(|(name, _)| *name == key) {
+            warnings.push(ConfigWarning::Hectors { key, instead });
             continue;
         }
         let origin = Origin::File { path: path.to_owned(), line: node.referenced.line() };

@@ -284,6 +284,7 @@ mod tests {
             stamp: stamp.map(Stamp),
             pose_in_map: Pose2::new(x, 0.0, 0.0),
             covariance: Matrix3::zeros(),
+            has_odometry: true,
             map_from_odom: Pose2::IDENTITY,
             particles: Arc::new([]),
             report: None,

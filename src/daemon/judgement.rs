@@ -6,6 +6,7 @@ use super::ledger::Verdict;
 use super::mapper::Gauges;
 use super::snapshot::{Snapshot, State};
 use super::status::InputStatus;
+use crate::slam::update::WeakDirection;
 
 /// Scans that come less often than this, s, have stopped coming.
 const SCANS_STOPPED_S: f64 = 3.0;
@@ -38,6 +39,7 @@ pub(super) fn judge(now: &Circumstances<'_>) -> (State, String) {
         .or_else(|| unusable_scans(now))
         .or_else(|| overload(now))
         .or_else(|| no_match(now))
+        .or_else(|| weak_direction(now))
         .unwrap_or_else(|| mapping(now))
 }
 
@@ -114,6 +116,23 @@ fn no_match(now: &Circumstances<'_>) -> Option<(State, String)> {
         mean * 100.0
     );
     Some((State::Degraded, detail))
+}
+
+fn weak_direction(now: &Circumstances<'_>) -> Option<(State, String)> {
+    let WeakDirection { x, y, turn } = (*now.gauges.weakness.back()?)?;
+    let what = if turn.abs() > x.abs().max(y.abs()) {
+        "how far the robot turns".to_owned()
+    } else {
+        format!("how far it moves along the direction ({x:.2}, {y:.2}) of the map")
+    };
+    let has_odometry = now.snapshot.estimate.has_odometry;
+    let who = if has_odometry {
+        "there odometry alone decides"
+    } else {
+        "and without odometry the map may shrink there"
+    };
+    let state = if has_odometry { State::Mapping } else { State::Degraded };
+    Some((state, format!("the scans do not tell {what}, as in a plain corridor: {who}")))
 }
 
 fn mapping(now: &Circumstances<'_>) -> (State, String) {

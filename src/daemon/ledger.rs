@@ -22,10 +22,8 @@ pub enum Verdict {
     NoUsableBeams,
     /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
-    /// Odometry for its stamp did not come in time.
+    /// Odometry for its stamp did not come in time, or no pose is given to map along.
     NoOdometry,
-    /// The engine maps along given poses, and none was given for its stamp.
-    NoPose,
     /// Where the laser sits on the robot is not known.
     NoMount,
     /// The laser does not scan parallel to the floor.
@@ -46,14 +44,13 @@ pub enum Verdict {
 
 impl Verdict {
     /// All verdicts, so that a count of zero is told too.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 14] = [
         Self::Processed,
         Self::NotMovedEnough,
         Self::Throttled,
         Self::NoUsableBeams,
         Self::BadOdometry,
         Self::NoOdometry,
-        Self::NoPose,
         Self::NoMount,
         Self::TiltedMount,
         Self::BadGeometry,

@@ -13,14 +13,16 @@ use super::keys::InputKeys;
 use super::ledger::{Entry, Ledger, Verdict};
 use super::mailbox::{Event, Mail, Mailbox};
 use super::snapshot::{Estimate, MapVersion, Snapshot};
-use super::synchronizer::{self, Call, Channel, ReadyScan, Refusal, ScanCounts, Synchronizer};
+use super::synchronizer::{
+    self, Call, Channel, Need, ReadyScan, Refusal, ScanCounts, Synchronizer,
+};
 use crate::clock::{self, Stopwatch};
 use crate::config::Config;
 use crate::slam::engine::{Engine, Sweep};
 use crate::slam::gmapping::ThreadsError;
 use crate::slam::odometry::JumpGuard;
 use crate::slam::pose::{Pose2, Stamp};
-use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate};
+use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate, WeakDirection};
 use crate::statistics::Spread;
 use crate::tf::{Kind, TfCounts, Transform};
 use crate::timeline::TimelineCounts;
@@ -65,6 +67,12 @@ pub struct Gauges {
     pub recent: VecDeque<Verdict>,
     /// Shares of the particles that matched the last processed scans, oldest first.
     pub matched: VecDeque<f64>,
+    /// Scans that went without odometry.
+    pub without_odometry: u64,
+    /// Processed scans that left a direction open.
+    pub weak: u64,
+    /// What the last processed scans left open, oldest first.
+    pub weakness: VecDeque<Option<WeakDirection>>,
     /// Seconds of driving mapped, by the stamps of processed scans.
     pub mapped_s: f64,
     /// Seconds that the filter worked for it.
@@ -117,6 +125,7 @@ impl View {
             pose_in_map: Pose2::IDENTITY,
             covariance: nalgebra::Matrix3::zeros(),
             map_from_odom: Pose2::IDENTITY,
+            has_odometry: true,
             particles: Arc::new([]),
             report: None,
         };
@@ -165,14 +174,17 @@ impl Mapper {
         keys: &InputKeys,
         threads: usize,
     ) -> Result<Self, ThreadsError> {
+        let config = &config.with_poses_as_odometry();
         let parameters = config.parameters();
+        let engine = Engine::new(config.engine_parameters(), threads)?;
+        let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
             initial_pose: parameters.initial_pose,
             jump: parameters.jump,
-            engine: Engine::new(config.engine_parameters(), threads)?,
             map_update_interval: config.raw.map_update_interval,
-            synchronizer: synchronizer(config, keys),
+            synchronizer: synchronizer(config, keys, need),
+            engine,
             frames: frames(config, keys),
             view: View::new(),
             gauges: Gauges::default(),
@@ -266,7 +278,7 @@ impl Mapper {
         match call {
             Call::Odometry(_, odom_from_base) => self.add_odometry(odom_from_base),
             Call::Scan(ready) if self.view.paused => {
-                self.add_odometry(ready.odom_from_base);
+                ready.odom_from_base.into_iter().for_each(|pose| self.add_odometry(pose));
                 self.enter(Some(ready.scan.stamp), Verdict::Paused, String::new());
             }
             Call::Scan(ready) => self.add_scan(&ready),
@@ -284,10 +296,15 @@ impl Mapper {
     }
 
     fn add_scan(&mut self, ready: &ReadyScan) {
-        let ReadyScan { scan, mount, odom_from_base } = ready;
+        let &ReadyScan { ref scan, ref mount, odom_from_base } = ready;
         // Interpolated odometry passes the jump guard too; the scan's own counts no second time.
-        self.add_odometry(*odom_from_base);
-        let sweep = Sweep { scan, mount, odom_from_base: Some(*odom_from_base) };
+        odom_from_base.into_iter().for_each(|pose| self.add_odometry(pose));
+        self.view.estimate.has_odometry = odom_from_base.is_some();
+        if odom_from_base.is_none() {
+            self.view.odom_from_base = None;
+            self.gauges.without_odometry += 1;
+        }
+        let sweep = Sweep { scan, mount, odom_from_base };
         let watch = Stopwatch::start();
         match self.engine.add_scan(&sweep, &mut |_| ()) {
             ScanUpdate::Processed(report) => {
@@ -321,9 +338,14 @@ impl Mapper {
         push_bounded(&mut self.gauges.matched, share, RECENT);
         self.view.estimate.particles = hypotheses.into();
         self.view.estimate.covariance = self.engine.covariance();
+        let registered = report.registered;
+        self.gauges.weak += u64::from(report.weak_direction.is_some());
+        push_bounded(&mut self.gauges.weakness, report.weak_direction, RECENT);
         self.view.estimate.report = Some(report);
         self.renew_estimate(Some(stamp));
-        self.view.unpublished = Some(stamp);
+        if registered {
+            self.view.unpublished = Some(stamp);
+        }
         let last = self.view.map.as_ref().map(|map| stamp.seconds_since(map.stamp));
         // A clock that was set back does not stop the map.
         if last.is_none_or(|passed| passed >= self.map_update_interval || passed < 0.0) {
@@ -401,6 +423,7 @@ impl Mapper {
         self.view.paused = before.paused;
         self.view.version = before.version;
         self.gauges.matched.clear();
+        self.gauges.weakness.clear();
         self.renew_estimate(None);
         let at = match pose_in_map.or(self.initial_pose) {
             Some(pose) => format!("at {}", in_words(pose)),
@@ -410,6 +433,9 @@ impl Mapper {
     }
 
     fn set_pose(&mut self, pose_in_map: Pose2) -> (String, bool) {
+        if matches!(self.engine, Engine::KnownPoses(_)) {
+            return ("poses are given to this engine, and it takes no other".to_owned(), false);
+        }
         let mapping = self.engine.has_begun();
         self.engine.set_pose(pose_in_map);
         let stamp = self.view.estimate.stamp;
@@ -417,7 +443,7 @@ impl Mapper {
         self.renew_estimate(stamp);
         let place = in_words(pose_in_map);
         if mapping {
-            (format!("all particles are moved, so that the robot is at {place}"), true)
+            (format!("all hypotheses are moved, so that the robot is at {place}"), true)
         } else {
             (format!("the map will begin with the robot at {place}"), true)
         }
@@ -462,13 +488,14 @@ impl Mapper {
     }
 }
 
-fn synchronizer(config: &Config, keys: &InputKeys) -> Synchronizer {
+fn synchronizer(config: &Config, keys: &InputKeys, need: Need) -> Synchronizer {
     let raw = &config.raw;
     Synchronizer::new(synchronizer::Settings {
         odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
         most_waiting: raw.scan_queue,
         sweep_time_s: raw.sweep_time_s,
         source: raw.odometry_source,
+        need,
         odom_key: keys.of(Input::Odom).to_string(),
         tf_path: format!(
             "{} (from `{}` to `{}`)",
@@ -496,11 +523,11 @@ enum Flow {
 fn detail(verdict: Verdict, ready: &ReadyScan) -> String {
     match verdict {
         Verdict::NoUsableBeams => format!(
-            "none of its {} beams ends within range_max and maxUrange",
+            "none of its {} beams ends within range_max and maxUrange or laser_max_dist",
             ready.scan.ranges.len()
         ),
         Verdict::BadOdometry => {
-            let Pose2 { x, y, theta } = ready.odom_from_base;
+            let Pose2 { x, y, theta } = ready.odom_from_base.unwrap_or_default();
             format!("odometry has the base at x {x} m, y {y} m, yaw {theta} rad")
         }
         _ => String::new(),

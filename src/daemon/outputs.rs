@@ -399,10 +399,13 @@ async fn publish_transform(
             }
             _ = ticks.tick() => {
                 let Some(stamp) = clock.tell(running.elapsed().wall, ahead_ns) else { continue };
-                let map_from_odom = snapshots.borrow().estimate.map_from_odom;
                 let header = convert::header(stamp, &settings.map_frame);
-                let transform =
-                    convert::transform_stamped(header, &settings.odom_frame, map_from_odom);
+                let estimate = snapshots.borrow().estimate.clone();
+                let transform = if estimate.has_odometry {
+                    convert::transform_stamped(header, &settings.odom_frame, estimate.map_from_odom)
+                } else {
+                    convert::transform_stamped(header, &settings.base_frame, estimate.pose_in_map)
+                };
                 let message = ros::TfMessage { transforms: vec![transform] };
                 publisher.put(&message).await;
             }

@@ -21,7 +21,7 @@ use super::queries::Queryables;
 use super::ros_node::RosNode;
 use super::snapshot::Snapshot;
 use super::status::Status;
-use crate::config::Config;
+use crate::config::{Config, EngineKind};
 
 /// The key under the prefix of the token that lives as long as the daemon answers.
 pub const ALIVE: &str = "slam/alive";
@@ -36,6 +36,8 @@ pub struct Settings {
     pub map_frame: String,
     /// The frame of odometry.
     pub odom_frame: String,
+    /// Frame of the robot.
+    pub base_frame: String,
     /// Metres a cell, for the map before there is one.
     pub resolution: f64,
     /// Between two publications of the map at least.
@@ -56,9 +58,14 @@ impl Settings {
         Self {
             map_frame: raw.map_frame.clone(),
             odom_frame: raw.odom_frame.clone(),
+            base_frame: raw.base_frame.clone(),
             resolution: raw.resolution,
             map_update_interval: duration(raw.map_update_interval),
-            transform_publish_period: duration(raw.transform_publish_period),
+            transform_publish_period: match raw.engine {
+                EngineKind::Gmapping | EngineKind::Hector => duration(raw.transform_publish_period),
+                // Whoever gives the poses tells them.
+                EngineKind::KnownPoses => Duration::ZERO,
+            },
             tf_delay_s: raw.tf_delay.unwrap_or(raw.transform_publish_period),
             save_directory,
         }

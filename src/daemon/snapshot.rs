@@ -36,10 +36,12 @@ pub struct Estimate {
     pub stamp: Option<Stamp>,
     /// The base in `map`.
     pub pose_in_map: Pose2,
-    /// Of the cloud of particles: m², m rad, rad².
+    /// Of the cloud of particles, or of the match: m², m rad, rad².
     pub covariance: Matrix3<f64>,
     /// What takes odometry to the map.
     pub map_from_odom: Pose2,
+    /// Whether the last scan came with odometry; without, `map` to the base is told.
+    pub has_odometry: bool,
     /// The base in `map`, one pose a particle, at the last processed scan.
     pub particles: Arc<[Pose2]>,
     /// About the last processed scan; `None` before the first.

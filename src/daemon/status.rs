@@ -17,6 +17,7 @@ use super::snapshot::{MapVersion, Snapshot, State};
 use super::synchronizer::Channel;
 use crate::clock;
 use crate::slam::pose::Pose2;
+use crate::slam::update::WeakDirection;
 use crate::statistics::Spread;
 use crate::timeline::TimelineCounts;
 
@@ -89,6 +90,12 @@ pub struct FilterStatus {
     pub resamples: u64,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Scans that went without odometry; only engines that can do without have such.
+    pub scans_without_odometry: u64,
+    /// Processed scans that left a direction open, where the engine looks for it.
+    pub weak_directions: u64,
+    /// What the last processed scan left open: a unit vector in `map`; `null` if nothing.
+    pub weak_direction: Option<WeakDirection>,
 }
 
 /// About the map.
@@ -268,5 +275,8 @@ fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
         effective_sample_size: report.map(|report| report.effective_sample_size),
         resamples: snapshot.resamples,
         odometry_jumps: gauges.odometry_jumps,
+        scans_without_odometry: gauges.without_odometry,
+        weak_directions: gauges.weak,
+        weak_direction: report.and_then(|report| report.weak_direction),
     }
 }

@@ -48,10 +48,21 @@ pub struct Settings {
     /// Seconds from the first beam of a sweep to the last; `None` is as the scan says, and 0 takes
     /// all at once.
     pub sweep_time_s: Option<f64>,
+    /// Whether scans are of use without odometry.
+    pub need: Need,
     /// The key of odometry messages.
     pub odom_key: String,
     /// Which transforms tell odometry, in words: key and frames.
     pub tf_path: String,
+}
+
+/// What becomes of a scan whose odometry does not come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Need {
+    /// It is refused.
+    Required,
+    /// It goes without. While no odometry has come at all, only the first waits for it.
+    Optional,
 }
 
 /// Odometry's messages or its transforms.
@@ -90,8 +101,8 @@ pub struct ReadyScan {
     pub scan: Scan,
     /// How the laser sits.
     pub mount: LaserMount,
-    /// The base at the scan's stamp.
-    pub odom_from_base: Pose2,
+    /// The base at the scan's stamp; `None` if it goes without odometry.
+    pub odom_from_base: Option<Pose2>,
 }
 
 /// A scan that does not reach the filter.
@@ -121,6 +132,8 @@ pub struct ScanCounts {
 struct Waiting {
     framed: FramedScan,
     since: Instant,
+    /// Whether it has waited long enough to go without odometry.
+    goes_without: bool,
 }
 
 impl Waiting {
@@ -133,8 +146,15 @@ impl Waiting {
 #[derive(Debug)]
 struct Place {
     mount: LaserMount,
-    odom_from_base: Pose2,
+    odom_from_base: Option<Pose2>,
     velocity: Velocity,
+}
+
+impl Place {
+    /// Of a robot without odometry.
+    fn still(mount: LaserMount) -> Self {
+        Self { mount, odom_from_base: None, velocity: Velocity::default() }
+    }
 }
 
 /// Why a scan is not ready.
@@ -169,6 +189,8 @@ pub struct Synchronizer {
     suspect: Option<Stamp>,
     calls: VecDeque<Call>,
     counts: ScanCounts,
+    /// Whether a scan has waited for the first odometry in vain.
+    waited_in_vain: bool,
 }
 
 impl Synchronizer {
@@ -185,6 +207,7 @@ impl Synchronizer {
             suspect: None,
             calls: VecDeque::new(),
             counts: ScanCounts::default(),
+            waited_in_vain: false,
         }
     }
 
@@ -218,6 +241,7 @@ impl Synchronizer {
         let wanted = match self.settings.source {
             OdometrySource::Odom => channel == Channel::Messages,
             OdometrySource::Tf => channel == Channel::Transforms,
+            OdometrySource::None => false,
             OdometrySource::Auto => match self.channel {
                 None => true,
                 Some(Channel::Transforms) if channel == Channel::Messages && self.fed.is_none() => {
@@ -247,7 +271,7 @@ impl Synchronizer {
             return;
         }
         self.counts.reordered += u64::from(position < self.waiting.len());
-        self.waiting.insert(position, Waiting { framed, since: now });
+        self.waiting.insert(position, Waiting { framed, since: now, goes_without: false });
         self.release(frames);
         self.make_room();
     }
@@ -305,8 +329,13 @@ impl Synchronizer {
     }
 
     fn give_up(&mut self, frames: &Frames, which: impl Fn(&Waiting) -> bool) {
-        for waiting in std::mem::take(&mut self.waiting) {
-            match self.place(&waiting.framed, frames) {
+        for mut waiting in std::mem::take(&mut self.waiting) {
+            match self.place(&waiting, frames) {
+                Err(lack) if which(&waiting) && self.can_go_without(&lack) => {
+                    waiting.goes_without = true;
+                    self.waited_in_vain = true;
+                    self.waiting.push_back(waiting);
+                }
                 Err(lack) if which(&waiting) => {
                     self.refuse(waiting.stamp(), lack.verdict, lack.detail);
                 }
@@ -369,7 +398,7 @@ impl Synchronizer {
     /// after it.
     fn release(&mut self, frames: &Frames) {
         while let Some(first) = self.waiting.pop_front() {
-            match self.place(&first.framed, frames) {
+            match self.place(&first, frames) {
                 Ok(Place { mount, odom_from_base, velocity }) => {
                     let mut scan = first.framed.scan;
                     scan.geometry = self.timed(&scan).with_velocity(velocity);
@@ -401,8 +430,8 @@ impl Synchronizer {
     }
 
     /// How the laser sat and where odometry had the base when a scan was taken.
-    fn place(&self, framed: &FramedScan, frames: &Frames) -> Result<Place, Lack> {
-        let stamp = framed.scan.stamp;
+    fn place(&self, waiting: &Waiting, frames: &Frames) -> Result<Place, Lack> {
+        let (framed, stamp) = (&waiting.framed, waiting.stamp());
         let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
             let (verdict, chance) = match error {
                 MountError::Tilted { .. } => (Verdict::TiltedMount, Chance::Gone),
@@ -411,9 +440,24 @@ impl Synchronizer {
             };
             Lack { verdict, detail: error.to_string(), chance }
         })?;
-        let odom_from_base = self.odometry_at(stamp)?;
-        let velocity = self.velocity(&framed.scan, odom_from_base)?;
-        Ok(Place { mount, odom_from_base, velocity })
+        let none_comes = self.channel.is_none() && self.waited_in_vain;
+        if self.settings.source == OdometrySource::None || none_comes {
+            return Ok(Place::still(mount));
+        }
+        match self.odometry_during(&framed.scan) {
+            Ok((pose, velocity)) => Ok(Place { mount, odom_from_base: Some(pose), velocity }),
+            Err(lack) if self.can_go_without(&lack) => {
+                let now = waiting.goes_without || lack.chance == Chance::Gone;
+                if now { Ok(Place::still(mount)) } else { Err(lack) }
+            }
+            Err(lack) => Err(lack),
+        }
+    }
+
+    /// Where the base was at the stamp of a scan, and how fast during its sweep.
+    fn odometry_during(&self, scan: &Scan) -> Result<(Pose2, Velocity), Lack> {
+        let odom_from_base = self.odometry_at(scan.stamp)?;
+        Ok((odom_from_base, self.velocity(scan, odom_from_base)?))
     }
 
     /// How the base moved during a sweep, for which odometry at the end of it is needed.
@@ -442,6 +486,10 @@ impl Synchronizer {
             Some(seconds) => scan.geometry.with_time_increment(seconds / intervals),
             None => scan.geometry,
         }
+    }
+
+    fn can_go_without(&self, lack: &Lack) -> bool {
+        self.settings.need == Need::Optional && lack.verdict == Verdict::NoOdometry
     }
 
     fn odometry_at(&self, stamp: Stamp) -> Result<Pose2, Lack> {
@@ -494,7 +542,9 @@ impl Synchronizer {
         match (source, self.channel) {
             (OdometrySource::Odom, _) | (_, Some(Channel::Messages)) => format!("on {odom_key}"),
             (OdometrySource::Tf, _) | (_, Some(Channel::Transforms)) => format!("in {tf_path}"),
-            (OdometrySource::Auto, None) => format!("on {odom_key} or in {tf_path}"),
+            (OdometrySource::Auto | OdometrySource::None, None) => {
+                format!("on {odom_key} or in {tf_path}")
+            }
         }
     }
 }

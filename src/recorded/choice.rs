@@ -119,14 +119,16 @@ impl Topics {
                 transforms.retain(|other| *other != topic);
                 transforms.push(topic);
             }
-        } else if source != OdometrySource::Tf {
+        } else if !matches!(source, OdometrySource::Tf | OdometrySource::None) {
             odometry = match near(Kind::Odometry).as_slice() {
                 [] => None,
                 [topic] => Some(topic.clone()),
                 _ => return Err(several("odometry", &messages, "--odom")),
             };
         }
-        if odometry.is_none() && (transforms.is_empty() || source == OdometrySource::Odom) {
+        let wanted = source != OdometrySource::None;
+        if wanted && odometry.is_none() && (transforms.is_empty() || source == OdometrySource::Odom)
+        {
             return Err(Unclear::NoOdometry(every()));
         }
         transforms.extend(near(Kind::StaticTransforms));

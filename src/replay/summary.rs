@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::{Outcome, ScanTimes, Times, Verdict, phase_index};
 use crate::clock::{Elapsed, peak_resident_memory};
-use crate::config::{Config, RawConfig};
+use crate::config::{Config, EngineKind, RawConfig};
 use crate::logs::LogStatistics;
 use crate::slam::grid::tile_map::TileCounts;
 use crate::slam::update::{OdometryUpdate, Phase};
@@ -23,6 +23,8 @@ pub struct Summary {
     pub seed: u64,
     /// Threads the filter used.
     pub threads: usize,
+    /// Which system mapped.
+    pub engine: EngineKind,
     /// Number of hypotheses.
     pub particles: usize,
     /// Readings by verdict.
@@ -31,6 +33,8 @@ pub struct Summary {
     pub lines_by_keyword: BTreeMap<String, u64>,
     /// How often particles were drawn anew.
     pub resamples: u64,
+    /// Processed scans that left a direction open, where the engine looks for it.
+    pub weak_directions: u64,
     /// Effective sample sizes of processed scans; `null` when there are none.
     pub effective_sample_size: Option<SampleSizes>,
     /// Time and memory.
@@ -54,10 +58,15 @@ impl Summary {
             debug_build: cfg!(debug_assertions),
             seed: run.config.raw.seed,
             threads: run.threads,
-            particles: run.config.raw.particles,
+            engine: run.config.raw.engine,
+            particles: match run.config.raw.engine {
+                EngineKind::Gmapping => run.config.raw.particles,
+                EngineKind::Hector | EngineKind::KnownPoses => 1,
+            },
             readings,
             lines_by_keyword: run.log.lines_by_keyword.clone(),
             resamples: outcome.resamples,
+            weak_directions: outcome.weak,
             effective_sample_size: SampleSizes::of(&outcome.sample_sizes),
             timing: Timing::new(run, &outcome.times),
             tiles: outcome.tiles,

@@ -5,6 +5,7 @@ use nalgebra::Matrix3;
 use super::gmapping::{GMapping, Parameters, ThreadsError};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
+use super::hector::{self, Hector};
 use super::known_poses::{self, KnownPoses};
 use super::path::Path;
 use super::pose::Pose2;
@@ -16,6 +17,8 @@ use super::update::{OdometryUpdate, Phase, ScanReading, ScanUpdate, SkipReason};
 pub enum EngineParameters {
     /// A particle filter, with the seed of its random numbers.
     GMapping(Parameters, u64),
+    /// One hypothesis, by matching each scan with the map.
+    Hector(hector::Parameters),
     /// Mapping along given poses.
     KnownPoses(known_poses::Parameters),
 }
@@ -25,6 +28,8 @@ pub enum EngineParameters {
 pub enum Engine {
     /// A particle filter.
     GMapping(Box<GMapping>),
+    /// One hypothesis, by matching each scan with the map.
+    Hector(Box<Hector>),
     /// Mapping along given poses, which come in place of odometry: `odom` is `map`.
     KnownPoses(Box<KnownPoses>),
 }
@@ -50,6 +55,9 @@ impl Engine {
             EngineParameters::GMapping(parameters, seed) => {
                 Ok(Self::GMapping(Box::new(GMapping::new(parameters, seed, threads)?)))
             }
+            EngineParameters::Hector(parameters) => {
+                Ok(Self::Hector(Box::new(Hector::new(parameters))))
+            }
             EngineParameters::KnownPoses(parameters) => {
                 Ok(Self::KnownPoses(Box::new(KnownPoses::new(parameters))))
             }
@@ -61,6 +69,7 @@ impl Engine {
     pub const fn needs_odometry(&self) -> bool {
         match self {
             Self::GMapping(_) | Self::KnownPoses(_) => true,
+            Self::Hector(_) => false,
         }
     }
 
@@ -69,6 +78,7 @@ impl Engine {
     pub fn reset(&mut self, initial_pose: Option<Pose2>) {
         match self {
             Self::GMapping(filter) => filter.reset(initial_pose),
+            Self::Hector(hector) => hector.reset(initial_pose),
             Self::KnownPoses(mapping) => mapping.reset(),
         }
     }
@@ -78,6 +88,7 @@ impl Engine {
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
         match self {
             Self::GMapping(filter) => filter.set_pose(pose_in_map),
+            Self::Hector(hector) => hector.set_pose(pose_in_map),
             Self::KnownPoses(_) => {}
         }
     }
@@ -86,6 +97,7 @@ impl Engine {
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         match self {
             Self::GMapping(filter) => filter.add_odometry(odom_from_base),
+            Self::Hector(hector) => hector.add_odometry(odom_from_base),
             Self::KnownPoses(mapping) => mapping.add_pose(odom_from_base),
         }
     }
@@ -103,6 +115,7 @@ impl Engine {
             (Self::GMapping(_) | Self::KnownPoses(_), None) => {
                 ScanUpdate::Skipped(SkipReason::BadOdometry)
             }
+            (Self::Hector(hector), _) => hector.add_scan(sweep, on_phase),
         }
     }
 
@@ -112,6 +125,7 @@ impl Engine {
     pub fn pose_in_map(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.pose_in_map(),
+            Self::Hector(hector) => hector.pose_in_map(),
             Self::KnownPoses(mapping) => mapping.pose_in_map(),
         }
     }
@@ -122,6 +136,7 @@ impl Engine {
     pub fn map_from_odom(&self) -> Pose2 {
         match self {
             Self::GMapping(filter) => filter.map_from_odom(),
+            Self::Hector(hector) => hector.map_from_odom(),
             Self::KnownPoses(_) => Pose2::IDENTITY,
         }
     }
@@ -131,6 +146,7 @@ impl Engine {
     pub fn covariance(&self) -> Matrix3<f64> {
         match self {
             Self::GMapping(filter) => filter.cloud_covariance(),
+            Self::Hector(hector) => hector.covariance(),
             Self::KnownPoses(_) => Matrix3::zeros(),
         }
     }
@@ -140,6 +156,8 @@ impl Engine {
     pub fn hypotheses(&self) -> Vec<Pose2> {
         match self {
             Self::GMapping(filter) => filter.particles().iter().map(|p| p.pose_in_map()).collect(),
+            Self::Hector(hector) if hector.has_begun() => vec![hector.pose_in_map()],
+            Self::Hector(_) => Vec::new(),
             Self::KnownPoses(mapping) if mapping.path().is_empty() => Vec::new(),
             Self::KnownPoses(mapping) => vec![mapping.pose_in_map()],
         }
@@ -150,6 +168,7 @@ impl Engine {
     pub fn has_begun(&self) -> bool {
         match self {
             Self::GMapping(filter) => !filter.particles().is_empty(),
+            Self::Hector(hector) => hector.has_begun(),
             Self::KnownPoses(mapping) => !mapping.path().is_empty(),
         }
     }
@@ -159,6 +178,7 @@ impl Engine {
     pub fn path(&self) -> Path {
         match self {
             Self::GMapping(filter) => filter.path(),
+            Self::Hector(hector) => hector.path().clone(),
             Self::KnownPoses(mapping) => mapping.path().clone(),
         }
     }
@@ -167,6 +187,7 @@ impl Engine {
     pub fn occupancy(&mut self) -> &OccupancyMap {
         match self {
             Self::GMapping(filter) => filter.occupancy(),
+            Self::Hector(hector) => hector.occupancy(),
             Self::KnownPoses(mapping) => mapping.occupancy(),
         }
     }
@@ -176,6 +197,7 @@ impl Engine {
     pub fn occupied_threshold(&self) -> f64 {
         match self {
             Self::GMapping(filter) => filter.occupied_threshold(),
+            Self::Hector(_) => hector::OCCUPIED_THRESHOLD,
             Self::KnownPoses(mapping) => mapping.occupied_threshold(),
         }
     }
@@ -192,6 +214,7 @@ impl Engine {
     pub fn tiles(&self) -> TileCounts {
         match self {
             Self::GMapping(filter) => filter.particle_tiles(),
+            Self::Hector(hector) => hector.tiles(),
             Self::KnownPoses(_) => TileCounts::default(),
         }
     }

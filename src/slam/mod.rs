@@ -7,6 +7,7 @@ pub mod deskew;
 pub mod engine;
 pub mod gmapping;
 pub mod grid;
+pub mod hector;
 pub mod known_poses;
 pub mod motion_gate;
 pub mod odometry;

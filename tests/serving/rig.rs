@@ -74,6 +74,7 @@ fn snapshot(filter: &GMapping, report: ScanReport, version: MapVersion) -> Snaps
         pose_in_map: filter.pose_in_map(),
         covariance: filter.cloud_covariance(),
         map_from_odom: filter.map_from_odom(),
+        has_odometry: true,
         particles: vec![filter.pose_in_map(); filter.particles().len()].into(),
         report: Some(report),
     };
@@ -88,6 +89,7 @@ pub(crate) fn nothing() -> Snapshot {
             pose_in_map: Pose2::IDENTITY,
             covariance: nalgebra::Matrix3::zeros(),
             map_from_odom: Pose2::IDENTITY,
+            has_odometry: true,
             particles: Arc::new([]),
             report: None,
         },
@@ -158,6 +160,7 @@ impl Rig {
         let settings = Settings {
             map_frame: "map".to_owned(),
             odom_frame: "odom".to_owned(),
+            base_frame: "base_link".to_owned(),
             resolution: 0.05,
             map_update_interval,
             transform_publish_period: Duration::from_millis(20),

@@ -2,6 +2,7 @@
 
 pub mod hit_map;
 pub mod likelihood_field;
+pub mod log_odds;
 pub mod occupancy;
 pub mod tile_map;
 

@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 use std::iter::Peekable;
 
 use super::super::pose::{Point2, Pose2};
-use super::tile_map::{TILE_SIZE, TileKey, TileMap, index_in_tile};
+use super::tile_map::{TILE_SIZE, Tile, TileKey, TileMap, index_in_tile};
 use super::{Cell, floor};
 
 /// Neighbouring beams further apart than this say nothing about what lies between them, rad.
@@ -78,10 +78,10 @@ pub struct OccupancyMap {
 
 /// Buffers that keep their memory from scan to scan.
 #[derive(Debug, Clone, Default)]
-struct Scratch {
+pub(super) struct Scratch {
     corners: Vec<Point2>,
     rows: Vec<Vec<Crossing>>,
-    hits: Vec<Cell>,
+    pub(super) hits: Vec<Cell>,
     /// Free cells of a row of tiles, by column of tiles.
     columns: Vec<Vec<Span>>,
 }
@@ -97,10 +97,10 @@ struct Crossing {
 
 /// Cells of one row from `start` up to `end`, not included.
 #[derive(Debug, Clone, Copy)]
-struct Span {
-    iy: i32,
-    start: i32,
-    end: i32,
+pub(super) struct Span {
+    pub(super) iy: i32,
+    pub(super) start: i32,
+    pub(super) end: i32,
 }
 
 /// Whether a scan is entered or taken out.
@@ -121,6 +121,11 @@ impl OccupancyMap {
     #[must_use]
     pub const fn counts(&self) -> &TileMap<Count> {
         &self.counts
+    }
+
+    /// A tile of the counts to write to.
+    pub(in super::super) fn tile_mut(&mut self, key: TileKey) -> &mut Tile<Count> {
+        self.counts.tile_mut(key)
     }
 
     /// Enters a scan taken with the base at `map_from_base`.
@@ -228,7 +233,7 @@ impl Count {
 
 impl Scratch {
     /// The free polygon's corners, in cells, and the cells that beams end in.
-    fn outline(&mut self, scan: &ScanOutline, map_from_base: Pose2, resolution: f64) {
+    pub(super) fn outline(&mut self, scan: &ScanOutline, map_from_base: Pose2, resolution: f64) {
         let (sin, cos) = libm::sincos(map_from_base.theta);
         let to_cells = |x: f64, y: f64| {
             Point2::new(
@@ -265,7 +270,7 @@ impl Scratch {
 
     /// Calls `take` with the free cells of each tile: those whose centres lie inside the polygon
     /// and in which no beam ends.
-    fn fill(&mut self, mut take: impl FnMut(TileKey, &[Span])) {
+    pub(super) fn fill(&mut self, mut take: impl FnMut(TileKey, &[Span])) {
         let (low, high) = bounds(&self.corners);
         let (bottom, top) = (floor(low.y), floor(high.y) + 1);
         let height = (top - bottom) as usize;

@@ -152,6 +152,73 @@ impl<C: Copy + Default> TileMap<C> {
     }
 }
 
+/// A part of a map in which many cells are read: whole pages, so that none is searched for.
+///
+/// Cells are counted from [`Self::first_cell`]; outside, every cell holds the default.
+#[derive(Debug)]
+pub struct Window<'a, C> {
+    first: Cell,
+    columns: usize,
+    pages: Vec<Option<&'a Page<C>>>,
+}
+
+impl<'a, C: Copy + Default> Window<'a, C> {
+    /// The pages of `map` from the one with the cell `low` to the one with `high`.
+    #[must_use]
+    pub fn between(map: &'a TileMap<C>, low: Cell, high: Cell) -> Self {
+        let [first, last] = [low, high].map(|cell| TileKey::containing(cell).page());
+        let columns = (last.tx - first.tx + 1) as usize;
+        let mut pages = vec![None; columns * (last.ty - first.ty + 1) as usize];
+        let start = map.pages.partition_point(|(page, _)| page.ty < first.ty);
+        let rows = map.pages[start..].iter().take_while(|(page, _)| page.ty <= last.ty);
+        for (key, page) in rows.filter(|(page, _)| (first.tx..=last.tx).contains(&page.tx)) {
+            let row = (key.ty - first.ty) as usize;
+            pages[row * columns + (key.tx - first.tx) as usize] = Some(&**page);
+        }
+        let shift = PAGE_SHIFT + TILE_SHIFT;
+        Self { first: Cell::new(first.tx << shift, first.ty << shift), columns, pages }
+    }
+
+    /// The lower-left cell of the window, in the map.
+    #[must_use]
+    pub const fn first_cell(&self) -> Cell {
+        self.first
+    }
+
+    /// The values of a cell, of its right, its upper and its upper right neighbour.
+    #[inline]
+    #[must_use]
+    pub fn square(&self, column: usize, row: usize) -> [C; 4] {
+        let (x, y) = (column % TILE_SIZE, row % TILE_SIZE);
+        if x + 1 < TILE_SIZE && y + 1 < TILE_SIZE {
+            let Some(tile) = self.tile(column, row) else { return [C::default(); 4] };
+            let index = y * TILE_SIZE + x;
+            return [index, index + 1, index + TILE_SIZE, index + TILE_SIZE + 1]
+                .map(|index| tile[index % TILE_CELLS]);
+        }
+        [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.get(column + dx, row + dy))
+    }
+
+    /// The value of one cell.
+    #[inline]
+    #[must_use]
+    pub fn get(&self, column: usize, row: usize) -> C {
+        let index = row % TILE_SIZE * TILE_SIZE + column % TILE_SIZE;
+        self.tile(column, row).map_or_else(C::default, |tile| tile[index])
+    }
+
+    #[inline]
+    fn tile(&self, column: usize, row: usize) -> Option<&'a Tile<C>> {
+        let page_column = column >> (PAGE_SHIFT + TILE_SHIFT);
+        if page_column >= self.columns {
+            return None;
+        }
+        let page = (row >> (PAGE_SHIFT + TILE_SHIFT)) * self.columns + page_column;
+        let slot = (row / TILE_SIZE % PAGE_SIZE) * PAGE_SIZE + column / TILE_SIZE % PAGE_SIZE;
+        self.pages.get(page).copied().flatten()?.tiles[slot].as_deref()
+    }
+}
+
 /// How many tiles some maps refer to, and how many there are when shared ones count once.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct TileCounts {

@@ -1,0 +1,154 @@
+//! A map of log-odds: ln(p / (1 - p)) of each cell being occupied, by Bayes' rule.
+//!
+//! A scan counts each cell once, and an obstacle beats free space within a scan. The log-odds are
+//! clamped on both sides, so that a cell turns as quickly from free to occupied as back; the
+//! original of Hector has no lower clamp.
+
+use super::super::pose::{Point2, Pose2};
+use super::Cell;
+use super::occupancy::{ScanOutline, Scratch};
+use super::tile_map::{TileKey, TileMap, index_in_tile};
+
+/// Steps of the fixed-point log-odds in a nat.
+const STEPS: f64 = 4096.0;
+/// Log-odds stay within this, nats: p from 0.018 to 0.982.
+pub const CLAMP: f64 = 4.0;
+const LIMIT: i16 = (CLAMP * STEPS) as i16;
+
+/// ln(p / (1 - p)) in steps of 1/4096; 0 is unknown.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LogOdds(i16);
+
+impl LogOdds {
+    /// The log-odds of the probability `p`, above 0 and below 1, clamped.
+    #[must_use]
+    pub fn of_probability(p: f64) -> Self {
+        let steps = libm::round(libm::log(p / (1.0 - p)) * STEPS);
+        Self(steps.clamp(f64::from(-LIMIT), f64::from(LIMIT)) as i16)
+    }
+
+    /// Nats.
+    #[must_use]
+    pub fn nats(self) -> f64 {
+        f64::from(self.0) / STEPS
+    }
+
+    /// What both know together, clamped.
+    #[inline]
+    #[must_use]
+    pub fn and(self, other: Self) -> Self {
+        Self(self.0.saturating_add(other.0).clamp(-LIMIT, LIMIT))
+    }
+
+    /// -1 unknown, 0 free, 1 occupied, as the original publishes it.
+    #[must_use]
+    pub const fn sign(self) -> i16 {
+        self.0.signum()
+    }
+
+    /// Where [`Probabilities`] has it.
+    #[inline]
+    const fn index(self) -> usize {
+        ((self.0 as u16 ^ 0x8000) >> 4) as usize
+    }
+}
+
+/// The probability that each value of the log-odds stands for, to look up.
+#[derive(Debug, Clone)]
+pub struct Probabilities(Box<[f32; 4096]>);
+
+impl Default for Probabilities {
+    fn default() -> Self {
+        let mut table = Box::new([0.5; 4096]);
+        for (index, p) in table.iter_mut().enumerate() {
+            // The middle of the sixteen values that share an entry; exact for unknown cells.
+            let nats = (index as f64 - 2048.0) * 16.0 / STEPS;
+            *p = (1.0 / (1.0 + libm::exp(-nats))) as f32;
+        }
+        Self(table)
+    }
+}
+
+impl Probabilities {
+    /// The probability of being occupied, to 0.001.
+    #[inline]
+    #[must_use]
+    pub fn of(&self, log_odds: LogOdds) -> f32 {
+        self.0[log_odds.index()]
+    }
+}
+
+/// What a scan says of a cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Evidence {
+    /// Of a cell that a beam passed.
+    pub free: LogOdds,
+    /// Of a cell that a beam ended in.
+    pub occupied: LogOdds,
+}
+
+/// Log-odds over the plane, for cells of one size.
+#[derive(Debug, Clone)]
+pub struct LogOddsMap {
+    resolution: f64,
+    cells: TileMap<LogOdds>,
+    scratch: Scratch,
+}
+
+impl LogOddsMap {
+    /// An unknown world in cells of `resolution` metres.
+    #[must_use]
+    pub fn new(resolution: f64) -> Self {
+        Self { resolution, cells: TileMap::new(), scratch: Scratch::default() }
+    }
+
+    /// Metres a cell.
+    #[must_use]
+    pub const fn resolution(&self) -> f64 {
+        self.resolution
+    }
+
+    /// The cells.
+    #[must_use]
+    pub const fn cells(&self) -> &TileMap<LogOdds> {
+        &self.cells
+    }
+
+    /// Enters a scan taken with the base at `map_from_base`, and calls `touched` with each tile
+    /// that it changes; some more than once.
+    pub fn add(
+        &mut self,
+        scan: &ScanOutline,
+        map_from_base: Pose2,
+        evidence: Evidence,
+        mut touched: impl FnMut(TileKey),
+    ) {
+        self.scratch.outline(scan, map_from_base, self.resolution);
+        let cells = &mut self.cells;
+        let mut row_of_tiles = None;
+        for cell in &self.scratch.hits {
+            let key = TileKey::containing(*cell);
+            let value = &mut cells.tile_mut(key)[index_in_tile(*cell)];
+            *value = value.and(evidence.occupied);
+            if row_of_tiles.replace(key) != Some(key) {
+                touched(key);
+            }
+        }
+        self.scratch.fill(|key, spans| {
+            touched(key);
+            let tile = cells.tile_mut(key);
+            for span in spans {
+                let index = index_in_tile(Cell::new(span.start, span.iy));
+                for value in &mut tile[index..index + (span.end - span.start) as usize] {
+                    *value = value.and(evidence.free);
+                }
+            }
+        });
+    }
+
+    /// The log-odds at a point of the map.
+    #[must_use]
+    pub fn at(&self, point_in_map: Point2) -> LogOdds {
+        self.cells.get(Cell::containing(point_in_map, self.resolution))
+    }
+}

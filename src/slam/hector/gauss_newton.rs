@@ -1,0 +1,246 @@
+//! Where a scan fits a map: Gauss-Newton on bilinearly interpolated occupancy (Kohlbrecher, von
+//! Stryk, Meyer, Klingauf, SSRR 2011), damped, together with what was known of the pose before.
+//!
+//! The original interpolates the derivatives with the wrong weights; here they are those of the
+//! interpolated occupancy.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::super::grid::Cell;
+use super::super::grid::log_odds::{LogOdds, LogOddsMap, Probabilities};
+use super::super::grid::tile_map::Window;
+use super::super::pose::{Pose2, wrap_angle};
+use super::weakness::Weakness;
+
+/// Residuals of beams that end in unknown or free space have this share of independent noise.
+pub const RESIDUAL_VARIANCE: f64 = 1.0;
+/// Steps at most, cells: bilinear interpolation sees no further.
+const LONGEST_STEP: f64 = 2.0;
+/// Steps below this, cells, end the search.
+const SHORTEST_STEP: f64 = 0.01;
+/// Room for the pose to move within a window, cells.
+const MARGIN: f64 = 24.0;
+
+/// What is known of a pose before the scan is looked at.
+#[derive(Debug, Clone, Copy)]
+pub struct Prior {
+    /// The base in `map`.
+    pub pose_in_map: Pose2,
+    /// Inverse of its covariance: m⁻², (m rad)⁻¹, rad⁻².
+    pub information: Matrix3<f64>,
+}
+
+impl Prior {
+    fn difference(&self, pose: Pose2) -> Vector3<f64> {
+        let mean = self.pose_in_map;
+        Vector3::new(pose.x - mean.x, pose.y - mean.y, wrap_angle(pose.theta - mean.theta))
+    }
+
+    /// Half the squared distance, as a negative log likelihood.
+    pub(super) fn cost(&self, pose: Pose2) -> f64 {
+        let difference = self.difference(pose);
+        0.5 * difference.dot(&(self.information * difference))
+    }
+}
+
+/// A scan in a map at one pose: Σ (1 - M)² over its points, and how that changes with the pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fit {
+    /// Σ (1 - M)².
+    pub cost: f64,
+    /// Half the gradient of the cost, with the sign turned: m⁻¹, m⁻¹, rad⁻¹.
+    pub descent: Vector3<f64>,
+    /// Σ JᵀJ with J the derivatives of M: m⁻², (m rad)⁻¹, rad⁻².
+    pub hessian: Matrix3<f64>,
+}
+
+/// A map as one scan is matched with it.
+#[derive(Debug)]
+pub struct Level<'a> {
+    window: Window<'a, LogOdds>,
+    probabilities: &'a Probabilities,
+    resolution: f64,
+    /// Of the scan, in the base frame, cells.
+    points: Vec<[f32; 2]>,
+}
+
+impl<'a> Level<'a> {
+    /// The part of `map` around a pose in which the points, up to `radius` metres away, may lie.
+    #[must_use]
+    pub fn new(
+        map: &'a LogOddsMap,
+        probabilities: &'a Probabilities,
+        points: Vec<[f32; 2]>,
+        (near, radius): (Pose2, f64),
+    ) -> Self {
+        let resolution = map.resolution();
+        let reach = (radius + MARGIN * resolution).min(1e4);
+        let corner = |sign: f64| {
+            let at = near.position();
+            let at = super::Point2::new(at.x + sign * reach, at.y + sign * reach);
+            Cell::containing(at, resolution)
+        };
+        let window = Window::between(map.cells(), corner(-1.0), corner(1.0));
+        Self { window, probabilities, resolution, points }
+    }
+
+    /// Metres a cell.
+    #[must_use]
+    pub const fn resolution(&self) -> f64 {
+        self.resolution
+    }
+
+    /// The points, in the base frame, cells.
+    #[must_use]
+    pub fn points(&self) -> &[[f32; 2]] {
+        &self.points
+    }
+
+    /// A position of `map` in cells of the window.
+    #[must_use]
+    pub fn in_window(&self, pose: Pose2) -> [f64; 2] {
+        let first = self.window.first_cell();
+        [
+            pose.x / self.resolution - f64::from(first.ix),
+            pose.y / self.resolution - f64::from(first.iy),
+        ]
+    }
+
+    /// The probability of a cell of the window, 0.5 outside.
+    #[inline]
+    #[must_use]
+    pub fn probability(&self, column: i32, row: i32) -> f32 {
+        if column < 0 || row < 0 {
+            return 0.5;
+        }
+        self.probabilities.of(self.window.get(column as usize, row as usize))
+    }
+
+    /// The interpolated occupancy at a point of the window, in cells, and its derivatives.
+    #[inline]
+    fn interpolate(&self, x: f32, y: f32) -> [f32; 3] {
+        // Cells' values are those of their centres.
+        let (x, y) = (x - 0.5, y - 0.5);
+        if !(x >= 0.0 && y >= 0.0) {
+            return [0.5, 0.0, 0.0];
+        }
+        let (column, row) = (x as usize, y as usize);
+        let (fx, fy) = (x - column as f32, y - row as f32);
+        let square = self.window.square(column, row);
+        let [m00, m10, m01, m11] = square.map(|cell| self.probabilities.of(cell));
+        let (bottom, top) = (m10 - m00, m11 - m01);
+        let (left, right) = (m01 - m00, m11 - m10);
+        let dx = bottom + fy * (top - bottom);
+        let dy = left + fx * (right - left);
+        [m00 + fx * bottom + fy * (left + fx * (right - left)), dx, dy]
+    }
+
+    /// How the scan fits with the base at `pose`.
+    #[must_use]
+    pub fn fit(&self, pose: Pose2) -> Fit {
+        let [x, y] = self.in_window(pose).map(|cells| cells as f32);
+        let (sin, cos) = libm::sincos(pose.theta);
+        let (sin, cos) = (sin as f32, cos as f32);
+        let (mut cost, mut b, mut h) = (0.0_f32, [0.0_f32; 3], [0.0_f32; 6]);
+        for &[px, py] in &self.points {
+            let (rx, ry) = (cos * px - sin * py, sin * px + cos * py);
+            let [m, dx, dy] = self.interpolate(x + rx, y + ry);
+            let turn = rx * dy - ry * dx;
+            let residual = 1.0 - m;
+            cost += residual * residual;
+            b[0] += dx * residual;
+            b[1] += dy * residual;
+            b[2] += turn * residual;
+            h[0] += dx * dx;
+            h[1] += dx * dy;
+            h[2] += dx * turn;
+            h[3] += dy * dy;
+            h[4] += dy * turn;
+            h[5] += turn * turn;
+        }
+        self.in_metres(cost, b, h)
+    }
+
+    fn in_metres(&self, cost: f32, b: [f32; 3], h: [f32; 6]) -> Fit {
+        let unit = Matrix3::from_diagonal(&Vector3::new(
+            1.0 / self.resolution,
+            1.0 / self.resolution,
+            1.0,
+        ));
+        let b = Vector3::from(b.map(f64::from));
+        let [xx, xy, xt, yy, yt, tt] = h.map(f64::from);
+        let hessian = Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, tt);
+        Fit { cost: f64::from(cost), descent: unit * b, hessian: unit * hessian * unit }
+    }
+
+    /// The pose of at most `steps` damped steps from `start` that fits scan and prior best.
+    #[must_use]
+    pub fn descend(&self, problem: &Problem<'_>, start: Pose2, steps: usize) -> (Pose2, Fit) {
+        let mut pose = start;
+        let mut fit = self.fit(pose);
+        let mut cost = problem.cost(&fit, pose);
+        let mut damping = 1e-3;
+        for _ in 0..steps {
+            let Some(step) = problem.step(&fit, pose, damping) else { break };
+            let step = self.limited(step, problem.lever);
+            let next = moved(pose, step);
+            let next_fit = self.fit(next);
+            let next_cost = problem.cost(&next_fit, next);
+            if next_cost <= cost {
+                (pose, fit, cost) = (next, next_fit, next_cost);
+                damping *= 0.1;
+            } else {
+                damping = (damping * 100.0).max(0.1);
+            }
+            if self.length(step, problem.lever) < SHORTEST_STEP {
+                break;
+            }
+        }
+        (pose, fit)
+    }
+
+    /// How far a step moves what is seen, cells.
+    fn length(&self, step: Vector3<f64>, lever: f64) -> f64 {
+        let turn = lever * step.z;
+        (step.x * step.x + step.y * step.y + turn * turn).sqrt() / self.resolution
+    }
+
+    fn limited(&self, step: Vector3<f64>, lever: f64) -> Vector3<f64> {
+        let length = self.length(step, lever);
+        if length > LONGEST_STEP { step * (LONGEST_STEP / length) } else { step }
+    }
+}
+
+/// What is to be fitted beside the map.
+#[derive(Debug)]
+pub struct Problem<'a> {
+    /// What is known of the pose.
+    pub prior: &'a Prior,
+    /// What the scan does not tell.
+    pub weakness: &'a Weakness,
+    /// Root mean square distance of what is seen from the base, m.
+    pub lever: f64,
+    /// What the scan's information is worth: 1 / variance of a residual.
+    pub gain: f64,
+}
+
+impl Problem<'_> {
+    fn cost(&self, fit: &Fit, pose: Pose2) -> f64 {
+        0.5 * self.gain * fit.cost + self.prior.cost(pose)
+    }
+
+    fn step(&self, fit: &Fit, pose: Pose2, damping: f64) -> Option<Vector3<f64>> {
+        let (hessian, descent) = self.weakness.without(fit, pose.theta);
+        let mut information = self.gain * hessian + self.prior.information;
+        let pull = self.prior.information * self.prior.difference(pose);
+        let rhs = self.gain * descent - pull;
+        for axis in 0..3 {
+            information[(axis, axis)] *= 1.0 + damping;
+        }
+        Some(information.cholesky()?.solve(&rhs))
+    }
+}
+
+fn moved(pose: Pose2, step: Vector3<f64>) -> Pose2 {
+    Pose2::new(pose.x + step.x, pose.y + step.y, wrap_angle(pose.theta + step.z))
+}

@@ -1,0 +1,371 @@
+//! Hector mapping: each scan is matched with the map so far (Kohlbrecher, von Stryk, Meyer,
+//! Klingauf, SSRR 2011), redesigned.
+//!
+//! [`Hector::add_scan`] is the algorithm; each of its steps has a file of its own. Beyond the
+//! original: the map grows, what is known of the motion enters the match, a poor guess is bettered
+//! by a search, and directions that the scan does not tell are left to the guess.
+
+pub mod correlation;
+pub mod gauss_newton;
+mod parameters;
+pub mod prediction;
+pub mod prepared_scan;
+pub mod pyramid;
+pub mod weakness;
+
+use nalgebra::Matrix3;
+
+use self::correlation::Search;
+use self::gauss_newton::{Fit, Level, Problem};
+pub use self::parameters::Parameters;
+use self::prediction::Prediction;
+use self::prepared_scan::{Directions, PreparedScan};
+use self::pyramid::Pyramid;
+use self::weakness::Weakness;
+use super::engine::Sweep;
+use super::grid::occupancy::{Count, OccupancyMap};
+use super::grid::tile_map::{TileCounts, TileKey};
+use super::odometry::Motion;
+use super::path::Path;
+use super::pose::{Point2, Pose2, Stamp};
+use super::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipReason};
+
+/// Steps on the coarse maps and on the finest, as in the original.
+const COARSE_STEPS: usize = 4;
+const FINE_STEPS: usize = 6;
+/// A prior less sure than this many cells of the coarsest map is bettered by a search.
+const POOR_PRIOR: f64 = 0.5;
+/// A match counts if its points lie in cells of this probability on average.
+const LEAST_MEAN: f64 = 0.3;
+/// Independent beams among those of a scan: neighbours err alike.
+const GAIN: f64 = 1.0;
+/// What a hit in an occupied cell is worth to the search, nats.
+const SEARCH_GAIN: f64 = 1.0;
+
+/// The engine.
+#[derive(Debug)]
+pub struct Hector {
+    parameters: Parameters,
+    directions: Directions,
+    pyramid: Pyramid,
+    /// At the last processed scan; `None` before the first.
+    state: Option<State>,
+    odometry: Odometry,
+    path: Path,
+    output: Output,
+    scans_seen: usize,
+}
+
+/// Where the robot was at the last processed scan.
+#[derive(Debug, Clone, Copy)]
+struct State {
+    stamp: Stamp,
+    pose_in_map: Pose2,
+    covariance: Matrix3<f64>,
+    /// Since the processed scan before, a second; for want of odometry.
+    velocity: Option<Pose2>,
+    /// Where the robot was at the last scan that entered the map.
+    registered_at: Pose2,
+}
+
+/// What odometry said last, and since the last processed scan.
+#[derive(Debug, Default)]
+struct Odometry {
+    odom_from_base: Option<Pose2>,
+    since_processed: Motion,
+    map_from_odom: Option<Pose2>,
+}
+
+/// A scan's place.
+#[derive(Debug)]
+struct Placed {
+    pose_in_map: Pose2,
+    covariance: Matrix3<f64>,
+    matched: bool,
+    score: f64,
+    weakness: Weakness,
+}
+
+impl Hector {
+    /// An engine with no scan yet.
+    #[must_use]
+    pub fn new(parameters: Parameters) -> Self {
+        Self {
+            directions: Directions::default(),
+            pyramid: Pyramid::new(&parameters),
+            state: None,
+            odometry: Odometry::default(),
+            path: Path::default(),
+            output: Output::new(parameters.resolution),
+            scans_seen: 0,
+            parameters,
+        }
+    }
+
+    /// Forgets map and path, as if nothing had been read: the next scan is the first, at
+    /// `initial_pose` in `map`, or where odometry says.
+    pub fn reset(&mut self, initial_pose: Option<Pose2>) {
+        let parameters = Parameters { initial_pose, ..self.parameters.clone() };
+        *self = Self::new(parameters);
+    }
+
+    /// Says where the base is in `map`: before the first scan, where the map begins; later, the
+    /// robot is there, and the map stays where it is.
+    pub fn set_pose(&mut self, pose_in_map: Pose2) {
+        let Some(state) = &mut self.state else {
+            self.parameters.initial_pose = Some(pose_in_map);
+            return;
+        };
+        *state = State { pose_in_map, velocity: None, ..*state };
+        self.odometry.since_processed = Motion::default();
+        self.odometry.anchor(pose_in_map);
+    }
+
+    /// Takes an odometry reading: the base in `odom`.
+    pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
+        let jump = &self.parameters.jump;
+        if !jump.is_usable(odom_from_base) {
+            return OdometryUpdate::NotUsable;
+        }
+        let Some(before) = self.odometry.odom_from_base.replace(odom_from_base) else {
+            return OdometryUpdate::Accepted;
+        };
+        let step = before.between(odom_from_base);
+        if jump.rejects(step) {
+            self.odometry.map_from_odom = None;
+            return OdometryUpdate::JumpRejected;
+        }
+        self.odometry.since_processed.extend(step);
+        OdometryUpdate::Accepted
+    }
+
+    /// Takes a scan; `on_phase` is called as each phase of processing ends.
+    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: &mut dyn FnMut(Phase)) -> ScanUpdate {
+        let scan = match self.admit(sweep) {
+            Ok(scan) => scan,
+            Err(reason) => return ScanUpdate::Skipped(reason),
+        };
+        let placed = self.place(&scan, sweep);
+        on_phase(Phase::Match);
+        on_phase(Phase::Resample);
+        let registered = self.advance(sweep, &placed);
+        if registered {
+            let Self { pyramid, output, .. } = self;
+            pyramid.add(&scan, placed.pose_in_map, |tile| output.stale.push(tile));
+        }
+        on_phase(Phase::Register);
+        on_phase(Phase::Map);
+        ScanUpdate::Processed(ScanReport {
+            hits: scan.hits.len(),
+            matched: usize::from(placed.matched),
+            best_score: placed.score,
+            effective_sample_size: 1.0,
+            entropy: 0.0,
+            resampled: false,
+            registered,
+            weak_direction: placed.weakness.direction_in_map(placed.pose_in_map.theta),
+        })
+    }
+
+    /// The scan made ready, if it is to be processed.
+    fn admit(&mut self, sweep: &Sweep<'_>) -> Result<PreparedScan, SkipReason> {
+        self.scans_seen += 1;
+        if let Some(odom_from_base) = sweep.odom_from_base
+            && self.add_odometry(odom_from_base) == OdometryUpdate::NotUsable
+        {
+            return Err(SkipReason::BadOdometry);
+        }
+        if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans.max(1)) {
+            return Err(SkipReason::Throttled);
+        }
+        let scan = self.directions.prepare(sweep.scan, sweep.mount, &self.parameters);
+        if scan.hits.is_empty() { Err(SkipReason::NoUsableBeams) } else { Ok(scan) }
+    }
+
+    /// Where the scan was taken, as far as the map, odometry and the motion so far tell.
+    fn place(&self, scan: &PreparedScan, sweep: &Sweep<'_>) -> Placed {
+        let lever = lever(&scan.hits);
+        let weakness = Weakness::of(&scan.hits, lever);
+        let Some(state) = &self.state else {
+            let odometry = sweep.odom_from_base.unwrap_or_default();
+            let pose_in_map = self.parameters.initial_pose.unwrap_or(odometry);
+            let covariance = Matrix3::zeros();
+            return Placed { pose_in_map, covariance, matched: true, score: 0.0, weakness };
+        };
+        let prediction = self.predict(state, sweep);
+        let Some(prior) = prediction.prior() else {
+            let Prediction { pose_in_map, covariance } = prediction;
+            return Placed { pose_in_map, covariance, matched: false, score: 0.0, weakness };
+        };
+        let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
+        let levels: Vec<Level<'_>> = self.pyramid.levels(scan, prior.pose_in_map).collect();
+        let mut start = prior.pose_in_map;
+        let deviations = prediction.deviations();
+        let poor = POOR_PRIOR * levels[0].resolution();
+        if deviations[0] > poor || deviations[1] * lever > poor {
+            let gain = SEARCH_GAIN;
+            let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
+            start = search.run();
+        }
+        let (pose, fit) = descend(&levels, &problem, start);
+        let points = levels.last().map_or(0, |level| level.points().len()) as f64;
+        let score = points - fit.cost;
+        let (hessian, _) = weakness.without(&fit, pose.theta);
+        let information = GAIN * hessian + prior.information;
+        let covariance = information.try_inverse().unwrap_or(prediction.covariance);
+        let matched = score > LEAST_MEAN * points;
+        Placed { pose_in_map: pose, covariance, matched, score, weakness }
+    }
+
+    fn predict(&self, state: &State, sweep: &Sweep<'_>) -> Prediction {
+        let Self { odometry, parameters, .. } = self;
+        let from = (state.pose_in_map, state.covariance);
+        if sweep.odom_from_base.is_some() && odometry.map_from_odom.is_some() {
+            return Prediction::by_odometry(
+                from,
+                &odometry.since_processed,
+                parameters.motion_noise,
+            );
+        }
+        let seconds = sweep.scan.stamp.seconds_since(state.stamp);
+        Prediction::by_velocity(from, state.velocity, seconds)
+    }
+
+    /// Goes on to where the scan was taken; whether it is to enter the map.
+    fn advance(&mut self, sweep: &Sweep<'_>, placed: &Placed) -> bool {
+        let (pose_in_map, stamp) = (placed.pose_in_map, sweep.scan.stamp);
+        let last = self.state.map(|state| state.registered_at);
+        let registered = last.is_none_or(|last| {
+            let moved = last.between(pose_in_map);
+            moved.position().norm() > self.parameters.update_distance
+                || moved.theta.abs() > self.parameters.update_angle
+        });
+        let velocity = self.state.and_then(|state| {
+            let seconds = stamp.seconds_since(state.stamp);
+            prediction::velocity(state.pose_in_map.between(pose_in_map), seconds)
+        });
+        self.state = Some(State {
+            stamp,
+            pose_in_map,
+            covariance: placed.covariance,
+            velocity,
+            registered_at: last.filter(|_| !registered).unwrap_or(pose_in_map),
+        });
+        self.odometry.since_processed = Motion::default();
+        if sweep.odom_from_base.is_none() {
+            // What odometry says next has no beginning that this scan shares.
+            self.odometry.odom_from_base = None;
+            self.odometry.map_from_odom = None;
+        } else {
+            self.odometry.anchor(pose_in_map);
+        }
+        self.path.push(stamp, pose_in_map);
+        registered
+    }
+
+    /// The base in `map` at the last processed scan, with odometry since; the initial pose before
+    /// the first.
+    #[must_use]
+    pub fn pose_in_map(&self) -> Pose2 {
+        let initial = self.parameters.initial_pose.unwrap_or_default();
+        let processed = self.state.map_or(initial, |state| state.pose_in_map);
+        processed * self.odometry.since_processed.increment
+    }
+
+    /// What takes odometry poses to the map; the identity before the first scan and without
+    /// odometry.
+    #[must_use]
+    pub fn map_from_odom(&self) -> Pose2 {
+        match (&self.state, self.odometry.odom_from_base) {
+            (Some(_), Some(odom_from_base)) => self.pose_in_map() * odom_from_base.inverse(),
+            _ => Pose2::IDENTITY,
+        }
+    }
+
+    /// How sure the pose of the last processed scan is, relative to the map: m², m rad, rad².
+    #[must_use]
+    pub fn covariance(&self) -> Matrix3<f64> {
+        self.state.map_or_else(Matrix3::zeros, |state| state.covariance)
+    }
+
+    /// Whether a scan has been processed.
+    #[must_use]
+    pub const fn has_begun(&self) -> bool {
+        self.state.is_some()
+    }
+
+    /// The pose of the base at each processed scan, oldest first; it never changes afterwards.
+    #[must_use]
+    pub const fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The finest map as it is handed out: a cell more likely occupied than free was hit by the
+    /// one scan that saw it, as [`OCCUPIED_THRESHOLD`] reads it.
+    pub fn occupancy(&mut self) -> &OccupancyMap {
+        self.output.renew(&self.pyramid)
+    }
+
+    /// The tiles of all levels.
+    #[must_use]
+    pub fn tiles(&self) -> TileCounts {
+        self.pyramid.tiles()
+    }
+}
+
+/// A cell of [`Hector::occupancy`] is occupied when its hits / visits is above this.
+pub const OCCUPIED_THRESHOLD: f64 = 0.5;
+
+impl Odometry {
+    /// Takes note of where the base is in `map` as odometry stands.
+    fn anchor(&mut self, pose_in_map: Pose2) {
+        self.map_from_odom = self.odom_from_base.map(|odom| pose_in_map * odom.inverse());
+    }
+}
+
+/// Coarse to fine.
+fn descend(levels: &[Level<'_>], problem: &Problem<'_>, start: Pose2) -> (Pose2, Fit) {
+    let (finest, coarse) = levels.split_last().expect("there is a finest level");
+    let mut pose = start;
+    for level in coarse {
+        (pose, _) = level.descend(problem, pose, COARSE_STEPS);
+    }
+    finest.descend(problem, pose, FINE_STEPS)
+}
+
+/// Root mean square distance of the hits from the base, m.
+fn lever(hits: &[[f32; 2]]) -> f64 {
+    let sum: f32 = hits.iter().map(|[x, y]| x * x + y * y).sum();
+    (f64::from(sum) / hits.len().max(1) as f64).sqrt().max(0.1)
+}
+
+/// The map that is handed out, brought up to date when it is asked for.
+#[derive(Debug)]
+struct Output {
+    map: OccupancyMap,
+    /// Tiles that have changed since, some more than once.
+    stale: Vec<TileKey>,
+}
+
+impl Output {
+    fn new(resolution: f64) -> Self {
+        Self { map: OccupancyMap::new(resolution), stale: Vec::new() }
+    }
+
+    fn renew(&mut self, pyramid: &Pyramid) -> &OccupancyMap {
+        self.stale.sort_unstable();
+        self.stale.dedup();
+        for key in self.stale.drain(..) {
+            let Some(cells) = pyramid.finest().cells().tile(key) else { continue };
+            let counts = cells.map(|cell| match cell.sign() {
+                0 => Count::default(),
+                sign => Count { hits: u32::from(sign > 0), visits: 1 },
+            });
+            // A tile that stays as it is stays shared.
+            if self.map.counts().tile(key) != Some(&counts) {
+                *self.map.tile_mut(key) = counts;
+            }
+        }
+        &self.map
+    }
+}

@@ -1,0 +1,75 @@
+//! Maps of the same world in cells of growing size, each updated with every scan that enters.
+
+use super::super::grid::log_odds::{Evidence, LogOdds, LogOddsMap, Probabilities};
+use super::super::grid::tile_map::{TileCounts, TileKey};
+use super::super::pose::Pose2;
+use super::Parameters;
+use super::gauss_newton::Level;
+use super::prepared_scan::PreparedScan;
+
+/// The maps, finest first.
+#[derive(Debug, Clone)]
+pub struct Pyramid {
+    maps: Vec<LogOddsMap>,
+    probabilities: Probabilities,
+    evidence: Evidence,
+}
+
+impl Pyramid {
+    /// An unknown world.
+    #[must_use]
+    pub fn new(parameters: &Parameters) -> Self {
+        let levels = 0..parameters.levels.max(1);
+        let cell = |level: usize| parameters.resolution * (1_u64 << level) as f64;
+        Self {
+            maps: levels.map(|level| LogOddsMap::new(cell(level))).collect(),
+            probabilities: Probabilities::default(),
+            evidence: Evidence {
+                free: LogOdds::of_probability(parameters.free_probability),
+                occupied: LogOdds::of_probability(parameters.occupied_probability),
+            },
+        }
+    }
+
+    /// The finest map.
+    #[must_use]
+    pub fn finest(&self) -> &LogOddsMap {
+        &self.maps[0]
+    }
+
+    /// Enters a scan taken with the base at `pose_in_map` in each map; `touched` is called with
+    /// the tiles of the finest that change.
+    pub fn add(
+        &mut self,
+        scan: &PreparedScan,
+        pose_in_map: Pose2,
+        mut touched: impl FnMut(TileKey),
+    ) {
+        for (level, map) in self.maps.iter_mut().enumerate() {
+            map.add(&scan.outline, pose_in_map, self.evidence, |tile| {
+                if level == 0 {
+                    touched(tile);
+                }
+            });
+        }
+    }
+
+    /// The maps as a scan is matched with them near a pose, coarsest first.
+    pub fn levels<'a>(
+        &'a self,
+        scan: &'a PreparedScan,
+        near: Pose2,
+    ) -> impl Iterator<Item = Level<'a>> {
+        let radius = scan.radius();
+        self.maps.iter().rev().map(move |map| {
+            let points = scan.points(map.resolution());
+            Level::new(map, &self.probabilities, points, (near, radius))
+        })
+    }
+
+    /// The tiles of all maps.
+    #[must_use]
+    pub fn tiles(&self) -> TileCounts {
+        TileCounts::of(self.maps.iter().map(LogOddsMap::cells))
+    }
+}
