@@ -111,7 +111,8 @@ pub fn scan(message: ros::LaserScan) -> Result<Scan, ConvertError> {
         [message.angle_min.into(), message.angle_max.into()],
         message.angle_increment.into(),
         [message.range_min.into(), message.range_max.into()],
-    )?;
+    )?
+    .with_time_increment(message.time_increment.into());
     Ok(Scan { stamp: stamp(message.header.stamp)?, geometry, ranges: message.ranges })
 }
 
@@ -124,6 +125,7 @@ pub fn laser_scan(scan: &Scan, frame: &str) -> ros::LaserScan {
         angle_min: geometry.angle(0) as f32,
         angle_max: geometry.angle(ranges.len().saturating_sub(1)) as f32,
         angle_increment: geometry.angle_increment() as f32,
+        time_increment: geometry.time_increment() as f32,
         range_min: geometry.range_min() as f32,
         range_max: geometry.range_max() as f32,
         ranges: ranges.clone(),

@@ -14,6 +14,7 @@
 //! - [`doctor`]: what is wrong with a robot's scans and odometry;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
+//! - [`given_poses`]: poses of a file, to map along;
 //! - [`daemon`]: live mapping on a Zenoh mesh;
 //! - [`client`]: for programs on the mesh that follow robots;
 //! - [`recorded`]: recorded messages in the order in which the daemon takes them;
@@ -27,6 +28,7 @@ pub mod daemon;
 pub mod doctor;
 pub mod evaluation;
 pub mod files;
+pub mod given_poses;
 pub mod logs;
 pub mod map;
 pub mod playback;

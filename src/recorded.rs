@@ -122,6 +122,7 @@ impl Recorded {
         let synchronizer = Synchronizer::new(synchronizer::Settings {
             odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
             most_waiting: raw.scan_queue,
+            sweep_time_s: raw.sweep_time_s,
             source: self.topics.source,
             need: Need::Required,
             odom_key,

@@ -66,7 +66,7 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 19] = [
+const MAY_USE: [(&str, &[&str]); 20] = [
     ("slam", &[]),
     ("sim", &["slam"]),
     ("logs", &["ros", "slam"]),
@@ -75,6 +75,7 @@ const MAY_USE: [(&str, &[&str]); 19] = [
     ("convert", &["ros", "slam", "tf"]),
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
+    ("given_poses", &["evaluation", "slam", "timeline"]),
     ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
     ("recorded", &["clock", "config", "convert", "daemon", "logs", "ros", "slam", "tf"]),
     // Its tests read what the daemon writes.

@@ -9,10 +9,10 @@ use gmapd::config::Config;
 use gmapd::daemon::frames::FrameNames;
 use gmapd::daemon::ledger::Verdict;
 use gmapd::daemon::synchronizer::Refusal;
-use gmapd::logs::LogStatistics;
 use gmapd::logs::carmen::CarmenLog;
 use gmapd::logs::recording::{self, Format, Recording};
-use gmapd::recorded::{Recorded, Topics, Wanted};
+use gmapd::logs::{LogError, LogStatistics};
+use gmapd::recorded::{Event, Recorded, Topics, Wanted};
 
 /// Malformed lines and damaged places that are told one by one.
 const FAULTS_SHOWN: usize = 10;
@@ -60,6 +60,19 @@ impl Log {
         match self {
             Self::Carmen(log) => log.statistics(),
             Self::Recorded(recorded) => recorded.statistics(),
+        }
+    }
+
+    /// What the filter is to take, in its order.
+    pub(super) fn events<'a>(
+        &'a self,
+        config: &Config,
+    ) -> Result<Box<dyn Iterator<Item = Result<Event, LogError>> + 'a>, LogError> {
+        match self {
+            Self::Carmen(log) => {
+                Ok(Box::new(log.readings()?.map(|reading| reading.map(Event::Reading))))
+            }
+            Self::Recorded(recorded) => Ok(Box::new(recorded.readings(config).map(Ok))),
         }
     }
 

@@ -5,12 +5,16 @@ use std::io::Write as _;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, ensure};
+use anyhow::{Context as _, bail, ensure};
 use clap::Args;
 use gmapd::clock::Stopwatch;
-use gmapd::config::Config;
+use gmapd::config::{Config, EngineKind};
+use gmapd::daemon::ledger::Verdict;
+use gmapd::daemon::synchronizer::Refusal;
 use gmapd::evaluation::{tum, tum_of_path};
 use gmapd::files::write_atomically;
+use gmapd::given_poses::GivenPoses;
+use gmapd::logs::Reading;
 use gmapd::map;
 use gmapd::recorded::Event;
 use gmapd::replay::{Hashes, Outcome, PhaseTimes, Replay, Run, Summary};
@@ -40,6 +44,7 @@ use super::progress::Progress;
         gmapd replay rosbag2_2026_01_01/ --scan /front/scan --odom /odom --out out\n  \
         gmapd replay run.mcap --expect 1f0a5c...   (the map's hash, as a replay prints it)\n  \
         gmapd replay intel.log.gz --config config/gmapd.yaml --set maxUrange=40 --out out\n  \
+        gmapd replay intel.log --engine known_poses --poses out/trajectory.tum --out again\n  \
         gmapd replay intel.log --set particles=30 --set delta=0.1 --seed 7 --json")]
 pub(crate) struct Arguments {
     /// Recorded log
@@ -58,6 +63,10 @@ pub(crate) struct Arguments {
     /// Which system maps; the same as --set engine=ENGINE
     #[arg(long, value_name = "ENGINE")]
     engine: Option<String>,
+    /// Poses to map along, for --engine known_poses: TUM's format, or stamp x y theta.
+    /// Without, those of the log: its corrected ones, or transforms from map_frame to base_frame
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
     /// Seed of the random numbers; the same as --set seed=N
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -74,7 +83,12 @@ pub(crate) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let config = load_config(arguments)?;
-    let log = Log::open(&arguments.log, &arguments.topics, &config)?;
+    // Where a file gives poses, the log's odometry is odometry.
+    let of_log = match arguments.poses {
+        Some(_) => config.clone(),
+        None => config.with_poses_as_odometry(),
+    };
+    let log = Log::open(&arguments.log, &arguments.topics, &of_log)?;
     log.warn(&arguments.log);
     if let Some(directory) = &arguments.out {
         std::fs::create_dir_all(directory)
@@ -82,7 +96,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let threads = arguments.threads.get();
     let watch = Stopwatch::start();
-    let outcome = replay(&log, &config, Replay::new(&config, threads)?)?;
+    let replay = Replay::new(&config, threads)?;
+    let outcome = match poses(arguments, &config)? {
+        Poses::Odometry => along_odometry(&log, &config, replay)?,
+        Poses::OfLog => along_corrected_poses(&log, &config, replay)?,
+        Poses::Given(poses) => along_given_poses(&log, &config, replay, &poses)?,
+    };
     let elapsed = watch.elapsed();
 
     let products = Products::of(&outcome);
@@ -120,35 +139,102 @@ fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
     Ok(config)
 }
 
-fn replay(log: &Log, config: &Config, mut replay: Replay) -> anyhow::Result<Outcome> {
+/// Where the poses come from that go in with the scans.
+enum Poses {
+    /// The engine corrects odometry.
+    Odometry,
+    /// The log tells where the robot was in the map.
+    OfLog,
+    /// A file does.
+    Given(GivenPoses),
+}
+
+fn poses(arguments: &Arguments, config: &Config) -> anyhow::Result<Poses> {
+    match (&arguments.poses, config.raw.engine) {
+        (Some(path), EngineKind::KnownPoses) => Ok(Poses::Given(GivenPoses::read(path)?)),
+        (None, EngineKind::KnownPoses) => Ok(Poses::OfLog),
+        (Some(_), _) => bail!("--poses is for --engine known_poses; other engines find poses"),
+        (None, _) => Ok(Poses::Odometry),
+    }
+}
+
+fn along_odometry(log: &Log, config: &Config, mut replay: Replay) -> anyhow::Result<Outcome> {
     let mut progress = Progress::new(log.statistics());
-    match log {
-        Log::Carmen(log) => {
-            for reading in log.readings()? {
-                let reading = reading?;
-                replay.add(&reading);
+    let mut refusals = Refusals::default();
+    for event in log.events(config)? {
+        match event? {
+            Event::Reading(reading) => {
+                add(&mut replay, log, &reading);
                 progress.advance(reading.stamp);
             }
+            Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
-        Log::Recorded(recorded) => {
-            let mut refusals = Refusals::default();
-            for event in recorded.readings(config) {
-                match event {
-                    Event::Reading(reading) => {
-                        replay.add_received(&reading);
-                        progress.advance(reading.stamp);
-                    }
-                    Event::Refused(refusal) => {
-                        replay.refuse();
-                        refusals.add(refusal);
-                    }
-                }
-            }
-            refusals.warn();
-        }
+    }
+    refusals.warn();
+    progress.finish();
+    Ok(replay.finish())
+}
+
+fn along_corrected_poses(
+    log: &Log,
+    config: &Config,
+    mut replay: Replay,
+) -> anyhow::Result<Outcome> {
+    let Log::Carmen(carmen) = log else { return along_odometry(log, config, replay) };
+    let mut progress = Progress::new(log.statistics());
+    for reading in carmen.corrected_readings()? {
+        let reading = reading?;
+        replay.add(&reading);
+        progress.advance(reading.stamp);
     }
     progress.finish();
     Ok(replay.finish())
+}
+
+fn along_given_poses(
+    log: &Log,
+    config: &Config,
+    mut replay: Replay,
+    poses: &GivenPoses,
+) -> anyhow::Result<Outcome> {
+    let mut progress = Progress::new(log.statistics());
+    let mut refusals = Refusals::default();
+    for event in log.events(config)? {
+        match event? {
+            Event::Reading(mut reading) => {
+                progress.advance(reading.stamp);
+                match poses.at(reading.stamp) {
+                    Ok(map_from_base) => {
+                        reading.odom_from_base = map_from_base;
+                        add(&mut replay, log, &reading);
+                    }
+                    Err(missing) if reading.scan.is_some() => {
+                        let (stamp, detail) = (Some(reading.stamp), missing.to_string());
+                        let refusal = Refusal { stamp, verdict: Verdict::NoOdometry, detail };
+                        refuse(&mut replay, &mut refusals, refusal);
+                    }
+                    Err(_) => {}
+                }
+            }
+            Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
+        }
+    }
+    refusals.warn();
+    progress.finish();
+    Ok(replay.finish())
+}
+
+/// Recorded readings have been messages already.
+fn add(replay: &mut Replay, log: &Log, reading: &Reading) {
+    match log {
+        Log::Carmen(_) => replay.add(reading),
+        Log::Recorded(_) => replay.add_received(reading),
+    };
+}
+
+fn refuse(replay: &mut Replay, refusals: &mut Refusals, refusal: Refusal) {
+    replay.refuse();
+    refusals.add(refusal);
 }
 
 /// Fails if another map was expected; both hashes are told.

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub use raw::{
-    EngineKind, Interop, Jump, Keys, Laser, Matcher, OdometrySource, RawConfig, RosDistro,
+    EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher, OdometrySource, RawConfig, RosDistro,
     Smoothing,
 };
 pub use source::Origin;
@@ -23,8 +23,10 @@ use crate::slam::gmapping::{
     MapParameters, MatcherKind, MatcherParameters, Parameters, WeightSmoothing, Weighting,
 };
 use crate::slam::hector;
+use crate::slam::known_poses::{self, MapExtent};
 use crate::slam::motion_gate::MotionGate;
 use crate::slam::odometry::{JumpGuard, JumpPolicy, MotionNoise};
+use crate::slam::outline::BeamLimits;
 use crate::slam::pose::Pose2;
 use crate::slam::scan::{LaserMount, MountOrientation};
 use source::Entries;
@@ -65,6 +67,25 @@ impl Config {
         match self.raw.engine {
             EngineKind::Gmapping => EngineParameters::GMapping(self.parameters(), self.raw.seed),
             EngineKind::Hector => EngineParameters::Hector(self.hector_parameters()),
+            EngineKind::KnownPoses => EngineParameters::KnownPoses(self.known_poses()),
+        }
+    }
+
+    fn known_poses(&self) -> known_poses::Parameters {
+        let raw = &self.raw;
+        known_poses::Parameters {
+            resolution: raw.resolution,
+            limits: BeamLimits {
+                max_range: raw.max_range,
+                max_usable_range: raw.max_usable_range,
+                free_on_no_return: raw.free_on_no_return,
+                furthest: known_poses::FURTHEST_CELL * raw.resolution,
+            },
+            extent: match raw.map_of {
+                MapOf::AllScans => MapExtent::AllScans,
+                MapOf::NewestScan => MapExtent::NewestScan,
+            },
+            occupied_threshold: raw.occupied_threshold,
         }
     }
 
@@ -125,6 +146,23 @@ impl Config {
                 free_on_no_return: raw.free_on_no_return,
             },
         }
+    }
+
+    /// The same for an engine that is given poses: what other engines have as odometry, `odom_frame`
+    /// to `base_frame`, are then the transforms from `map_frame`, and poses may jump.
+    ///
+    /// Messages of odometry are poses in `map` only where `odometry_source: odom` says so.
+    #[must_use]
+    pub fn with_poses_as_odometry(&self) -> Self {
+        let mut config = self.clone();
+        if config.raw.engine == EngineKind::KnownPoses {
+            config.raw.odom_frame.clone_from(&self.raw.map_frame);
+            config.raw.jump_policy = Jump::Continue;
+            if config.raw.odometry_source == OdometrySource::Auto {
+                config.raw.odometry_source = OdometrySource::Tf;
+            }
+        }
+        config
     }
 
     /// How the laser sits on the robot, where the configuration says so.
@@ -207,6 +245,7 @@ fn of_another_engine(key: &str, engine: EngineKind) -> Option<ConfigWarning> {
             let (_, instead) = raw::GMAPPING_ONLY.iter().find(|(name, _)| *name == key)?;
             ("gmapping", Some(*instead))
         }
+        EngineKind::KnownPoses => (raw::HECTOR_ONLY.contains(&key).then_some("hector")?, None),
     };
     Some(ConfigWarning::OtherEngine { key: key.to_owned(), of, instead })
 }

@@ -13,6 +13,8 @@ use crate::slam::{gmapping::Parameters, hector};
 pub struct RawConfig {
     /// Which system maps.
     pub engine: EngineKind,
+    /// Known poses: what the map is of.
+    pub map_of: MapOf,
     /// Number of hypotheses.
     pub particles: usize,
     /// Every n-th scan is looked at.
@@ -59,6 +61,9 @@ pub struct RawConfig {
     /// Readings above are not matched and free space ends there, m; left out, `maxRange`.
     #[serde(rename = "maxUrange")]
     pub max_usable_range: Option<f64>,
+    /// Seconds from the first beam of a sweep to the last; left out, as the scans say; 0, all at
+    /// once.
+    pub sweep_time_s: Option<f64>,
     /// Beams passed over between two that are matched.
     #[serde(rename = "lskip")]
     pub beam_skip: usize,
@@ -242,6 +247,8 @@ impl Default for RawConfig {
         let hector = hector::Parameters::default();
         Self {
             engine: EngineKind::Gmapping,
+            map_of: MapOf::AllScans,
+            sweep_time_s: None,
             particles: core.particles,
             throttle_scans: core.throttle_scans,
             base_frame: "base_link".to_owned(),
@@ -319,6 +326,18 @@ pub enum EngineKind {
     Gmapping,
     /// One hypothesis, by matching each scan with the map.
     Hector,
+    /// Mapping along poses that somebody else knows.
+    KnownPoses,
+}
+
+/// What the map along known poses is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MapOf {
+    /// All scans since the beginning.
+    AllScans,
+    /// The newest scan alone.
+    NewestScan,
 }
 
 /// How the laser sits on the robot.

@@ -22,7 +22,7 @@ pub enum Verdict {
     NoUsableBeams,
     /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
-    /// Odometry for its stamp did not come in time.
+    /// Odometry for its stamp did not come in time, or no pose is given to map along.
     NoOdometry,
     /// Where the laser sits on the robot is not known.
     NoMount,

@@ -177,6 +177,7 @@ impl Mapper {
         keys: &InputKeys,
         threads: usize,
     ) -> Result<Self, ThreadsError> {
+        let config = &config.with_poses_as_odometry();
         let parameters = config.parameters();
         let engine = Engine::new(config.engine_parameters(), threads)?;
         let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
@@ -443,6 +444,9 @@ impl Mapper {
     }
 
     fn set_pose(&mut self, pose_in_map: Pose2) -> (String, bool) {
+        if matches!(self.engine, Engine::KnownPoses(_)) {
+            return ("poses are given to this engine, and it takes no other".to_owned(), false);
+        }
         let mapping = self.engine.has_begun();
         self.engine.set_pose(pose_in_map);
         let stamp = self.view.estimate.stamp;
@@ -500,6 +504,7 @@ fn synchronizer(config: &Config, keys: &InputKeys, need: Need) -> Synchronizer {
     Synchronizer::new(synchronizer::Settings {
         odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
         most_waiting: raw.scan_queue,
+        sweep_time_s: raw.sweep_time_s,
         source: raw.odometry_source,
         need,
         odom_key: keys.of(Input::Odom).to_string(),

@@ -24,7 +24,7 @@ use super::snapshot::Snapshot;
 use super::status::Status;
 use super::tiles::run_number;
 use crate::clock;
-use crate::config::Config;
+use crate::config::{Config, EngineKind};
 
 /// The key under the prefix of the token that lives as long as the daemon answers.
 pub const ALIVE: &str = "slam/alive";
@@ -64,7 +64,11 @@ impl Settings {
             base_frame: raw.base_frame.clone(),
             resolution: raw.resolution,
             map_update_interval: duration(raw.map_update_interval),
-            transform_publish_period: duration(raw.transform_publish_period),
+            transform_publish_period: match raw.engine {
+                EngineKind::Gmapping | EngineKind::Hector => duration(raw.transform_publish_period),
+                // Whoever gives the poses tells them.
+                EngineKind::KnownPoses => Duration::ZERO,
+            },
             tf_delay_s: raw.tf_delay.unwrap_or(raw.transform_publish_period),
             save_directory,
         }

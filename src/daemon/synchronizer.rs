@@ -10,8 +10,9 @@ use std::time::{Duration, Instant};
 use super::frames::{Frames, MountError};
 use super::ledger::Verdict;
 use crate::config::OdometrySource;
+use crate::slam::deskew::Velocity;
 use crate::slam::pose::{Pose2, Stamp};
-use crate::slam::scan::{LaserMount, Scan};
+use crate::slam::scan::{LaserMount, Scan, ScanGeometry};
 use crate::timeline::{Missing, OdometryBuffer, TimelineCounts};
 
 /// How much odometry is kept, and at most how many samples: ten seconds at a kilohertz.
@@ -29,6 +30,9 @@ const CLOCK_SET_BACK: i64 = 500_000_000;
 /// A second scan after such a one belongs to it if it is not later than this, ns.
 const CLOCK_RESTARTED: i64 = 10_000_000_000;
 
+/// No laser takes longer for a sweep, s.
+const LONGEST_SWEEP_S: f64 = 1.0;
+
 /// Odometry that is missing by more than this, s, is hardly only late.
 const CLOCKS_DIFFER_S: f64 = 1.0;
 
@@ -41,6 +45,9 @@ pub struct Settings {
     pub most_waiting: usize,
     /// Where odometry comes from.
     pub source: OdometrySource,
+    /// Seconds from the first beam of a sweep to the last; `None` is as the scan says, and 0 takes
+    /// all at once.
+    pub sweep_time_s: Option<f64>,
     /// Whether scans are of use without odometry.
     pub need: Need,
     /// The key of odometry messages.
@@ -132,6 +139,21 @@ struct Waiting {
 impl Waiting {
     const fn stamp(&self) -> Stamp {
         self.framed.scan.stamp
+    }
+}
+
+/// Where and how fast the laser was that took a scan.
+#[derive(Debug)]
+struct Place {
+    mount: LaserMount,
+    odom_from_base: Option<Pose2>,
+    velocity: Velocity,
+}
+
+impl Place {
+    /// Of a robot without odometry.
+    fn still(mount: LaserMount) -> Self {
+        Self { mount, odom_from_base: None, velocity: Velocity::default() }
     }
 }
 
@@ -377,8 +399,9 @@ impl Synchronizer {
     fn release(&mut self, frames: &Frames) {
         while let Some(first) = self.waiting.pop_front() {
             match self.place(&first, frames) {
-                Ok((mount, odom_from_base)) => {
-                    let scan = first.framed.scan;
+                Ok(Place { mount, odom_from_base, velocity }) => {
+                    let mut scan = first.framed.scan;
+                    scan.geometry = self.timed(&scan).with_velocity(velocity);
                     self.feed(scan.stamp);
                     self.taken = Some(scan.stamp);
                     self.calls.push_back(Call::Scan(ReadyScan { scan, mount, odom_from_base }));
@@ -407,11 +430,7 @@ impl Synchronizer {
     }
 
     /// How the laser sat and where odometry had the base when a scan was taken.
-    fn place(
-        &self,
-        waiting: &Waiting,
-        frames: &Frames,
-    ) -> Result<(LaserMount, Option<Pose2>), Lack> {
+    fn place(&self, waiting: &Waiting, frames: &Frames) -> Result<Place, Lack> {
         let (framed, stamp) = (&waiting.framed, waiting.stamp());
         let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
             let (verdict, chance) = match error {
@@ -423,15 +442,49 @@ impl Synchronizer {
         })?;
         let none_comes = self.channel.is_none() && self.waited_in_vain;
         if self.settings.source == OdometrySource::None || none_comes {
-            return Ok((mount, None));
+            return Ok(Place::still(mount));
         }
-        match self.odometry_at(stamp) {
-            Ok(odom_from_base) => Ok((mount, Some(odom_from_base))),
+        match self.odometry_during(&framed.scan) {
+            Ok((pose, velocity)) => Ok(Place { mount, odom_from_base: Some(pose), velocity }),
             Err(lack) if self.can_go_without(&lack) => {
                 let now = waiting.goes_without || lack.chance == Chance::Gone;
-                if now { Ok((mount, None)) } else { Err(lack) }
+                if now { Ok(Place::still(mount)) } else { Err(lack) }
             }
             Err(lack) => Err(lack),
+        }
+    }
+
+    /// Where the base was at the stamp of a scan, and how fast during its sweep.
+    fn odometry_during(&self, scan: &Scan) -> Result<(Pose2, Velocity), Lack> {
+        let odom_from_base = self.odometry_at(scan.stamp)?;
+        Ok((odom_from_base, self.velocity(scan, odom_from_base)?))
+    }
+
+    /// How the base moved during a sweep, for which odometry at the end of it is needed.
+    fn velocity(&self, scan: &Scan, odom_from_base: Pose2) -> Result<Velocity, Lack> {
+        let beams = scan.ranges.len().saturating_sub(1) as f64;
+        let seconds = self.timed(scan).time_increment() * beams;
+        if seconds == 0.0 {
+            return Ok(Velocity::default());
+        }
+        if seconds.is_nan() || seconds.abs() > LONGEST_SWEEP_S {
+            let detail = format!(
+                "by its time_increment the sweep takes {seconds} s, which no laser needs; set \
+                 sweep_time_s in the configuration"
+            );
+            return Err(Lack { verdict: Verdict::BadGeometry, detail, chance: Chance::Gone });
+        }
+        let end = Stamp(scan.stamp.0.saturating_add((seconds * 1e9) as i64));
+        let motion = odom_from_base.between(self.odometry_at(end)?);
+        Ok(Velocity::of_motion(motion, seconds))
+    }
+
+    /// When the beams of a scan are taken: as configured, or as it says.
+    fn timed(&self, scan: &Scan) -> ScanGeometry {
+        let intervals = scan.ranges.len().saturating_sub(1).max(1) as f64;
+        match self.settings.sweep_time_s {
+            Some(seconds) => scan.geometry.with_time_increment(seconds / intervals),
+            None => scan.geometry,
         }
     }
 

@@ -80,6 +80,20 @@ impl CarmenLog {
         let lines = Lines::open(&self.path).map_err(open)?;
         Ok(Readings { path: self.path.clone(), lines, lasers: self.lasers })
     }
+
+    /// The usable readings in file order with the poses that their scans were corrected to:
+    /// `FLASER` lines have one of the laser beside that of odometry, which in a raw log is the
+    /// same; other lines with a scan have the robot's alone, and `ODOM` lines have none.
+    ///
+    /// # Errors
+    /// When the file cannot be opened again.
+    pub fn corrected_readings(
+        &self,
+    ) -> Result<impl Iterator<Item = Result<Reading, LogError>> + use<>, LogError> {
+        let mut readings = self.readings()?;
+        readings.lasers.flaser_pose = FlaserPose::OfLaser;
+        Ok(readings.filter(|reading| reading.as_ref().map_or(true, |r| r.scan.is_some())))
+    }
 }
 
 /// The usable readings of a log, one after the other.
@@ -127,6 +141,17 @@ struct Lasers {
     base_from_front_laser: Pose2,
     /// Of `ROBOTLASER1` lines: the mean of those that are close to the first.
     base_from_robot_laser: Option<Pose2>,
+    /// Which pose of `FLASER` lines is taken.
+    flaser_pose: FlaserPose,
+}
+
+/// The poses of an `FLASER` line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum FlaserPose {
+    /// The robot's, by its odometry.
+    OfOdometry,
+    /// The laser's, as some localisation corrected it.
+    OfLaser,
 }
 
 impl Default for Lasers {
@@ -135,6 +160,7 @@ impl Default for Lasers {
             range_max: f64::INFINITY,
             base_from_front_laser: Pose2::IDENTITY,
             base_from_robot_laser: None,
+            flaser_pose: FlaserPose::OfOdometry,
         }
     }
 }
@@ -241,6 +267,7 @@ impl Survey {
             range_max,
             base_from_front_laser: self.base_from_front_laser,
             base_from_robot_laser: self.robot_laser.mean(),
+            flaser_pose: FlaserPose::OfOdometry,
         };
         (lasers, self.statistics)
     }
@@ -301,13 +328,18 @@ fn parse_flaser(mut fields: Fields<'_>, lasers: &Lasers) -> Result<Reading, Line
     let beams = fields.beams()?;
     fields.expect(beams.saturating_add(11))?;
     let ranges = fields.ranges(beams)?;
-    fields.pose()?; // Of the laser, perhaps as some localisation corrected it.
-    let odom_from_base = fields.pose()?;
+    let corrected_laser = fields.pose()?;
+    let odometry = fields.pose()?;
+    let base_from_laser = lasers.base_from_front_laser;
+    let parent_from_base = match lasers.flaser_pose {
+        FlaserPose::OfOdometry => odometry,
+        FlaserPose::OfLaser => corrected_laser * base_from_laser.inverse(),
+    };
     let stamp = fields.stamp()?;
     let increment = sick_increment(beams);
     let geometry = geometry(-FRAC_PI_2, increment, beams, lasers.range_max)?;
     let scan = Scan { stamp, geometry, ranges };
-    Ok(scan_reading(scan, odom_from_base, lasers.base_from_front_laser))
+    Ok(scan_reading(scan, parent_from_base, base_from_laser))
 }
 
 /// `ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn

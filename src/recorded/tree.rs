@@ -92,10 +92,12 @@ pub(super) fn frame_names(survey: &Survey, topics: &Topics, config: &Config) -> 
     let laser = frame(&topics.scan, Kind::LaserScan).unwrap_or_default();
     let chain = tree.chain(&laser);
     let name = |name: &String| name.trim_start_matches('/').to_owned();
+    // Given poses are those in the map's frame, and no others.
+    let in_map = config.raw.odom_frame == config.raw.map_frame;
     let configured = (name(&config.raw.odom_frame), name(&config.raw.base_frame));
     let odom = Some(configured.0.clone())
         .filter(|odom| chain.contains(&odom.as_str()))
-        .or_else(|| tree.odometry_of(&chain).filter(|_| chain.len() > 1))
+        .or_else(|| tree.odometry_of(&chain).filter(|_| chain.len() > 1 && !in_map))
         .unwrap_or(configured.0);
     let told = topics.odometry.as_deref().and_then(|topic| frame(topic, Kind::Odometry));
     let below =

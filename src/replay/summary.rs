@@ -61,7 +61,7 @@ impl Summary {
             engine: run.config.raw.engine,
             particles: match run.config.raw.engine {
                 EngineKind::Gmapping => run.config.raw.particles,
-                EngineKind::Hector => 1,
+                EngineKind::Hector | EngineKind::KnownPoses => 1,
             },
             readings,
             lines_by_keyword: run.log.lines_by_keyword.clone(),

@@ -69,7 +69,7 @@ impl Lidar {
         time_s: f64,
         rng: &mut impl Rng,
     ) -> Vec<f32> {
-        let between_beams = self.sweep_duration_s / self.beams.saturating_sub(1).max(1) as f64;
+        let between_beams = self.between_beams_s();
         let mut base = world_from_base(time_s);
         let beam = |index| {
             let time_s = time_s + index as f64 * between_beams;
@@ -80,6 +80,16 @@ impl Lidar {
             self.measured(range, rng)
         };
         (0..self.beams).map(beam).collect()
+    }
+
+    /// What the laser says of its beams, with the time from each to the next.
+    #[must_use]
+    pub fn stated_geometry(&self) -> ScanGeometry {
+        self.geometry.with_time_increment(self.between_beams_s())
+    }
+
+    fn between_beams_s(&self) -> f64 {
+        self.sweep_duration_s / self.beams.saturating_sub(1).max(1) as f64
     }
 
     fn ray(&self, world_from_base: Pose2, index: usize) -> Ray {

@@ -163,7 +163,7 @@ impl Simulation {
         let mut rng = generator(self.seed, Purpose::Lidar, index as u64);
         let world_from_base = |time_s| self.trajectory.at(time_s);
         let ranges = self.lidar.sweep(&self.world, world_from_base, time_s(stamp), &mut rng);
-        Scan { stamp, geometry: self.lidar.geometry, ranges }
+        Scan { stamp, geometry: self.lidar.stated_geometry(), ranges }
     }
 
     /// Stamp of an odometry reading of a scan, counted from 1; the last is that of the scan.

@@ -6,6 +6,7 @@ use super::gmapping::{GMapping, Parameters, ThreadsError};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
 use super::grid::tile_map::TileCounts;
 use super::hector::{self, Hector};
+use super::known_poses::{self, KnownPoses};
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
@@ -18,6 +19,8 @@ pub enum EngineParameters {
     GMapping(Parameters, u64),
     /// One hypothesis, by matching each scan with the map.
     Hector(hector::Parameters),
+    /// Mapping along given poses.
+    KnownPoses(known_poses::Parameters),
 }
 
 /// A system that makes a map and a path of scans and odometry.
@@ -27,6 +30,8 @@ pub enum Engine {
     GMapping(Box<GMapping>),
     /// One hypothesis, by matching each scan with the map.
     Hector(Box<Hector>),
+    /// Mapping along given poses, which come in place of odometry: `odom` is `map`.
+    KnownPoses(Box<KnownPoses>),
 }
 
 /// A scan with what there is to use it.
@@ -53,6 +58,9 @@ impl Engine {
             EngineParameters::Hector(parameters) => {
                 Ok(Self::Hector(Box::new(Hector::new(parameters))))
             }
+            EngineParameters::KnownPoses(parameters) => {
+                Ok(Self::KnownPoses(Box::new(KnownPoses::new(parameters))))
+            }
         }
     }
 
@@ -60,7 +68,7 @@ impl Engine {
     #[must_use]
     pub const fn needs_odometry(&self) -> bool {
         match self {
-            Self::GMapping(_) => true,
+            Self::GMapping(_) | Self::KnownPoses(_) => true,
             Self::Hector(_) => false,
         }
     }
@@ -71,15 +79,17 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.reset(initial_pose),
             Self::Hector(hector) => hector.reset(initial_pose),
+            Self::KnownPoses(mapping) => mapping.reset(),
         }
     }
 
     /// Says where the base is in `map`: before the first scan, where the map begins; later, the
-    /// robot is moved, and the map stays where it is.
+    /// robot is moved, and the map stays where it is. Where poses are given, this has no effect.
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
         match self {
             Self::GMapping(filter) => filter.set_pose(pose_in_map),
             Self::Hector(hector) => hector.set_pose(pose_in_map),
+            Self::KnownPoses(_) => {}
         }
     }
 
@@ -88,6 +98,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.add_odometry(odom_from_base),
             Self::Hector(hector) => hector.add_odometry(odom_from_base),
+            Self::KnownPoses(mapping) => mapping.add_pose(odom_from_base),
         }
     }
 
@@ -98,7 +109,12 @@ impl Engine {
             (Self::GMapping(filter), Some(odom_from_base)) => {
                 filter.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
             }
-            (Self::GMapping(_), None) => ScanUpdate::Skipped(SkipReason::BadOdometry),
+            (Self::KnownPoses(mapping), Some(odom_from_base)) => {
+                mapping.add_scan(&ScanReading { scan, mount, odom_from_base }, on_phase)
+            }
+            (Self::GMapping(_) | Self::KnownPoses(_), None) => {
+                ScanUpdate::Skipped(SkipReason::BadOdometry)
+            }
             (Self::Hector(hector), _) => hector.add_scan(sweep, on_phase),
         }
     }
@@ -110,6 +126,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.pose_in_map(),
             Self::Hector(hector) => hector.pose_in_map(),
+            Self::KnownPoses(mapping) => mapping.pose_in_map(),
         }
     }
 
@@ -120,6 +137,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.map_from_odom(),
             Self::Hector(hector) => hector.map_from_odom(),
+            Self::KnownPoses(_) => Pose2::IDENTITY,
         }
     }
 
@@ -129,6 +147,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.cloud_covariance(),
             Self::Hector(hector) => hector.covariance(),
+            Self::KnownPoses(_) => Matrix3::zeros(),
         }
     }
 
@@ -139,6 +158,8 @@ impl Engine {
             Self::GMapping(filter) => filter.particles().iter().map(|p| p.pose_in_map()).collect(),
             Self::Hector(hector) if hector.has_begun() => vec![hector.pose_in_map()],
             Self::Hector(_) => Vec::new(),
+            Self::KnownPoses(mapping) if mapping.path().is_empty() => Vec::new(),
+            Self::KnownPoses(mapping) => vec![mapping.pose_in_map()],
         }
     }
 
@@ -148,6 +169,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => !filter.particles().is_empty(),
             Self::Hector(hector) => hector.has_begun(),
+            Self::KnownPoses(mapping) => !mapping.path().is_empty(),
         }
     }
 
@@ -157,6 +179,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.path(),
             Self::Hector(hector) => hector.path().clone(),
+            Self::KnownPoses(mapping) => mapping.path().clone(),
         }
     }
 
@@ -165,6 +188,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.occupancy(),
             Self::Hector(hector) => hector.occupancy(),
+            Self::KnownPoses(mapping) => mapping.occupancy(),
         }
     }
 
@@ -174,14 +198,17 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.occupied_threshold(),
             Self::Hector(_) => hector::OCCUPIED_THRESHOLD,
+            Self::KnownPoses(mapping) => mapping.occupied_threshold(),
         }
     }
 
     /// How often the map became another one since the first scan, not only a larger one.
     #[must_use]
-    pub const fn map_corrections(&self) -> u64 {
+    pub fn map_corrections(&self) -> u64 {
         match self {
             Self::GMapping(filter) => filter.map_corrections(),
+            Self::Hector(_) => 0,
+            Self::KnownPoses(mapper) => mapper.map_corrections(),
         }
     }
 
@@ -198,6 +225,7 @@ impl Engine {
         match self {
             Self::GMapping(filter) => filter.particle_tiles(),
             Self::Hector(hector) => hector.tiles(),
+            Self::KnownPoses(_) => TileCounts::default(),
         }
     }
 }

@@ -3,9 +3,10 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::deskew::Velocity;
 use super::pose::{Point2, Pose2, Stamp};
 
-/// Where the beams of a sweep point and which ranges they can measure.
+/// Where the beams of a sweep point, when each is taken, and which ranges they can measure.
 ///
 /// Beam `i` points at `angle_min + i * angle_increment`: this one table serves matching and
 /// mapping alike (the original used two that differ by half an increment).
@@ -16,6 +17,8 @@ pub struct ScanGeometry {
     angle_increment: f64,
     range_min: f64,
     range_max: f64,
+    time_increment: f64,
+    velocity: Velocity,
 }
 
 /// Why the geometry of a scan cannot be used.
@@ -81,7 +84,35 @@ impl ScanGeometry {
             angle_increment: if clockwise { -size } else { size },
             range_min,
             range_max,
+            time_increment: 0.0,
+            velocity: Velocity::default(),
         })
+    }
+
+    /// The same with `seconds` from beam to beam; 0 takes all at once.
+    #[must_use]
+    pub const fn with_time_increment(self, seconds: f64) -> Self {
+        Self { time_increment: seconds, ..self }
+    }
+
+    /// The same from a base that moves during the sweep.
+    #[must_use]
+    pub const fn with_velocity(self, velocity: Velocity) -> Self {
+        Self { velocity, ..self }
+    }
+
+    /// Seconds from beam to beam, as the sensor says; 0 where it does not say.
+    #[must_use]
+    pub const fn time_increment(&self) -> f64 {
+        self.time_increment
+    }
+
+    /// The base at beam `index`, seen from the base at the stamp; `None` where it stands still or
+    /// all beams are taken at once.
+    #[must_use]
+    pub fn motion_until(&self, index: usize) -> Option<Pose2> {
+        let moves = self.time_increment != 0.0 && self.velocity != Velocity::default();
+        moves.then(|| self.velocity.after(index as f64 * self.time_increment))
     }
 
     /// Direction of beam `index` in the laser frame, radians; not wrapped.
@@ -145,6 +176,26 @@ pub struct Scan {
     pub geometry: ScanGeometry,
     /// One range a beam, m; any count, and it may change from scan to scan.
     pub ranges: Vec<f32>,
+}
+
+impl Scan {
+    /// Where beam `index` is `range` metres from the laser, in the frame of the base at the stamp
+    /// of the scan: a base that moved since is taken into account.
+    #[must_use]
+    pub fn point_in_base(&self, mount: &LaserMount, index: usize, range: f64) -> Point2 {
+        let point = mount.point_in_base(self.geometry.angle(index), range);
+        match self.geometry.motion_until(index) {
+            Some(base_from_later_base) => base_from_later_base * point,
+            None => point,
+        }
+    }
+
+    /// Seconds from the first beam to the last, as the sensor says; negative where it counts beams
+    /// backwards.
+    #[must_use]
+    pub fn sweep_time(&self) -> f64 {
+        self.geometry.time_increment() * self.ranges.len().saturating_sub(1) as f64
+    }
 }
 
 /// Which side of the laser looks up.

@@ -5,7 +5,6 @@ use proptest::prelude::{any, prop_assert, prop_assert_eq, proptest};
 use super::super::frames::FrameNames;
 use super::*;
 use crate::clock;
-use crate::slam::scan::ScanGeometry;
 use crate::tf::{Kind, Transform};
 
 const TIMEOUT: Duration = Duration::from_millis(500);
@@ -14,6 +13,7 @@ fn settings() -> Settings {
     Settings {
         odometry_timeout: TIMEOUT,
         most_waiting: 4,
+        sweep_time_s: None,
         source: OdometrySource::Auto,
         need: Need::Required,
         odom_key: "robot01/odom".to_owned(),
@@ -441,4 +441,40 @@ fn without_a_source_no_odometry_is_taken_and_no_scan_waits() {
     assert!(!rig.odometry_on(Channel::Messages, 0));
     rig.scan(0);
     assert_eq!(rig.told(), ["s-"]);
+}
+
+/// Odometry moves by a metre a millisecond.
+#[test]
+fn a_sweep_waits_for_the_odometry_of_its_end_and_has_the_speed_between() {
+    let mut rig = Rig::new(Settings { sweep_time_s: Some(0.02), ..settings() });
+    rig.odometry(0);
+    rig.odometry(40);
+    rig.scan(30);
+    assert_eq!((rig.told().len(), rig.synchronizer.waiting()), (0, 1));
+    rig.odometry(60);
+    let calls = rig.calls();
+    let Some(Call::Scan(ready)) = calls.last() else { panic!("{calls:?}") };
+    assert_eq!(ready.odom_from_base.unwrap().x, 30.0);
+    let last = ready.scan.geometry.motion_until(2).expect("the base moves");
+    assert!((last.x - 20.0).abs() < 1e-9 && last.y == 0.0 && last.theta == 0.0, "{last:?}");
+}
+
+#[test]
+fn what_no_laser_takes_for_a_sweep_is_told() {
+    let mut rig = rig();
+    rig.odometry(0);
+    rig.odometry(40);
+    let geometry = ScanGeometry::new([0.0, 1.0], 0.5, [0.1, 9.0]).unwrap();
+    for (number, seconds) in (1..).zip([f64::NAN, 20.0]) {
+        let geometry = geometry.with_time_increment(seconds);
+        let scan = Scan { stamp: stamp(number), geometry, ranges: vec![1.0; 3] };
+        let framed = FramedScan { scan, frame: "base_link".to_owned() };
+        rig.synchronizer.scan(framed, rig.start, &rig.frames);
+    }
+    let details = rig.details();
+    assert_eq!(details.len(), 2);
+    assert!(
+        details[1].contains("takes 40 s") && details[1].contains("sweep_time_s"),
+        "{details:?}"
+    );
 }

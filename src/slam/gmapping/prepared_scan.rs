@@ -2,8 +2,7 @@
 
 use super::super::grid::likelihood_field::Points;
 use super::super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
-use super::super::pose::Point2;
-use super::super::scan::Beam;
+use super::super::outline::{BeamLimits, outline};
 use super::{Parameters, ScanReading};
 
 /// Of the hits, the climb looks at every second.
@@ -39,7 +38,13 @@ impl PreparedScan {
     /// Prepares a scan; `hits` is empty if no beam is usable.
     #[must_use]
     pub fn new(reading: &ScanReading<'_>, parameters: &Parameters) -> Self {
-        let outline = outline(reading, parameters);
+        let limits = BeamLimits {
+            max_range: parameters.max_range,
+            max_usable_range: parameters.max_usable_range,
+            free_on_no_return: parameters.map.free_on_no_return,
+            furthest: MAX_RADIUS * parameters.resolution,
+        };
+        let outline = outline(reading.scan, reading.mount, &limits);
         let resolution = parameters.resolution;
         let in_cells = |end: &BeamEnd| {
             (end.kind == BeamEndKind::Hit)
@@ -57,36 +62,6 @@ impl PreparedScan {
             radius: radius as i32 + 1,
             outline,
         }
-    }
-}
-
-/// Where the beams end in the base frame.
-///
-/// As in slam_gmapping, readings above `maxRange` say nothing, and readings between `maxUrange`
-/// and `maxRange` make free space up to `maxUrange`. Beams without return make none where neither
-/// the parameters nor the sensor say how far it sees.
-fn outline(reading: &ScanReading<'_>, parameters: &Parameters) -> ScanOutline {
-    let geometry = &reading.scan.geometry;
-    let max_range = parameters.max_range.unwrap_or(f64::INFINITY);
-    let usable = parameters.max_usable_range.unwrap_or(geometry.range_max());
-    let usable = usable.min(max_range).min(MAX_RADIUS * parameters.resolution);
-    let limit = parameters.max_usable_range.or(parameters.max_range);
-    let reach_known = limit.is_some() || geometry.range_max().is_finite();
-    let free_on_no_return = parameters.map.free_on_no_return && reach_known;
-    let end = |(index, range): (usize, &f32)| {
-        let (range, kind) = match geometry.classify(*range) {
-            Beam::Hit(range) if range <= usable => (range, BeamEndKind::Hit),
-            Beam::Hit(range) if range <= max_range => (usable, BeamEndKind::Free),
-            Beam::NoReturn if free_on_no_return => (usable, BeamEndKind::Free),
-            Beam::Hit(_) | Beam::NoReturn | Beam::Invalid => (0.0, BeamEndKind::Nothing),
-        };
-        let Point2 { x, y } = reading.mount.point_in_base(geometry.angle(index), range);
-        BeamEnd { point: [x as f32, y as f32], kind }
-    };
-    ScanOutline {
-        sensor: reading.mount.base_from_laser.position(),
-        ends: reading.scan.ranges.iter().enumerate().map(end).collect(),
-        angle_increment: geometry.angle_increment().abs(),
     }
 }
 

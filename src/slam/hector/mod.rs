@@ -27,7 +27,7 @@ use super::grid::tile_map::{TileCounts, TileKey};
 use super::odometry::Motion;
 use super::path::Path;
 use super::pose::{Pose2, Stamp};
-use super::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipReason};
+use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, SkipReason};
 
 /// How much of the usual score each scan renews.
 const RENEWAL: f64 = 0.1;
@@ -122,7 +122,7 @@ impl Hector {
     }
 
     /// Takes a scan; `on_phase` is called as each phase of processing ends.
-    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: &mut dyn FnMut(Phase)) -> ScanUpdate {
+    pub fn add_scan(&mut self, sweep: &Sweep<'_>, on_phase: OnPhase<'_>) -> ScanUpdate {
         let scan = match self.admit(sweep) {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),

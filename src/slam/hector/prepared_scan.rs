@@ -1,5 +1,6 @@
 //! A scan made ready for matching and mapping: classified, and transformed to the base.
 
+use super::super::deskew::Velocity;
 use super::super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
 use super::super::pose::Point2;
 use super::super::scan::{Beam, LaserMount, Scan, ScanGeometry};
@@ -65,7 +66,7 @@ impl Directions {
         let geometry = &scan.geometry;
         let limit = parameters.max_range;
         let sensor = mount.base_from_laser.position();
-        let end = |(range, [cos, sin]): (&f32, &[f64; 2])| {
+        let end = |(index, (range, [cos, sin])): (usize, (&f32, &[f64; 2]))| {
             let (range, kind) = match geometry.classify(*range) {
                 Beam::Hit(range) if range < parameters.min_range => (0.0, BeamEndKind::Nothing),
                 Beam::Hit(range) if range <= limit => (range, BeamEndKind::Hit),
@@ -75,10 +76,14 @@ impl Directions {
                 }
                 Beam::NoReturn | Beam::Invalid => (0.0, BeamEndKind::Nothing),
             };
-            let Point2 { x, y } = Point2::new(sensor.x + range * cos, sensor.y + range * sin);
+            let point = Point2::new(sensor.x + range * cos, sensor.y + range * sin);
+            let Point2 { x, y } = match geometry.motion_until(index) {
+                Some(base_from_later_base) => base_from_later_base * point,
+                None => point,
+            };
             BeamEnd { point: [x as f32, y as f32], kind }
         };
-        let ends: Vec<BeamEnd> = scan.ranges.iter().zip(&self.unit).map(end).collect();
+        let ends: Vec<BeamEnd> = scan.ranges.iter().zip(&self.unit).enumerate().map(end).collect();
         let hits = ends.iter().filter(|end| end.kind == BeamEndKind::Hit);
         PreparedScan {
             hits: hits.map(|end| end.point).collect(),
@@ -91,8 +96,10 @@ impl Directions {
     }
 
     fn point(&mut self, scan: &Scan, mount: &LaserMount) {
-        if self.of != Some((scan.geometry, *mount)) {
-            self.of = Some((scan.geometry, *mount));
+        // How fast the robot moves changes from scan to scan, and where its beams point does not.
+        let geometry = scan.geometry.with_velocity(Velocity::default());
+        if self.of != Some((geometry, *mount)) {
+            self.of = Some((geometry, *mount));
             self.unit.clear();
         }
         let known = self.unit.len();
