@@ -156,15 +156,22 @@ fn report(update: ScanUpdate) -> ScanReport {
     }
 }
 
+/// Whether the engine hears of odometry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Odometry {
+    Used,
+    None,
+}
+
 /// Where the robot is believed and truly is at the far end of the corridor, and the reports of
 /// scans that see neither end.
-fn corridor(with_odometry: bool) -> (f64, f64, Vec<ScanReport>) {
+fn corridor(odometry: Odometry) -> (f64, f64, Vec<ScanReport>) {
     let simulation = Simulation::new(&Scenario::new(Place::Corridor, 1)).expect("beams");
     // Neither end is seen from more than 10 m away.
     let mut hector = Hector::new(Parameters { max_range: 10.0, ..Parameters::default() });
     let (mut far, mut believed, mut amid) = (0.0, 0.0, Vec::new());
     for reading in simulation.readings() {
-        let odom_from_base = with_odometry.then_some(reading.odom_from_base);
+        let odom_from_base = (odometry == Odometry::Used).then_some(reading.odom_from_base);
         let mount = &simulation.lidar.mount;
         let sweep = Sweep { scan: &reading.scan, mount, odom_from_base };
         let report = report(hector.add_scan(&sweep, &mut |_| ()));
@@ -181,7 +188,7 @@ fn corridor(with_odometry: bool) -> (f64, f64, Vec<ScanReport>) {
 
 #[test]
 fn along_a_plain_corridor_odometry_decides_and_the_direction_is_told() {
-    let (far, believed, amid) = corridor(true);
+    let (far, believed, amid) = corridor(Odometry::Used);
     println!("{believed} m of {far} m");
     assert!((believed - far).abs() < 0.01 * far, "{believed} m of {far} m");
     for report in amid {
@@ -192,7 +199,7 @@ fn along_a_plain_corridor_odometry_decides_and_the_direction_is_told() {
 
 #[test]
 fn without_odometry_the_corridors_direction_is_told_all_the_same() {
-    let (_, _, amid) = corridor(false);
+    let (_, _, amid) = corridor(Odometry::None);
     assert!(amid.len() > 100 && amid.iter().all(|report| report.weak_direction.is_some()));
 }
 

@@ -242,6 +242,7 @@ pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
 pub(super) const COMPAT_KEYS: [&str; 4] = ["sigma", "kernelSize", "lsigma", "iterations"];
 
 impl Default for RawConfig {
+    #[expect(clippy::too_many_lines, reason = "one line a key")]
     fn default() -> Self {
         let core = Parameters::default();
         let hector = hector::Parameters::default();

@@ -88,7 +88,7 @@ impl Prediction {
 /// fast for one.
 #[must_use]
 pub fn velocity(step: Pose2, seconds: f64) -> Option<Pose2> {
-    let steady = seconds >= STEADY[0] && seconds <= STEADY[1];
+    let steady = (STEADY[0]..=STEADY[1]).contains(&seconds);
     let velocity = scaled(step, 1.0 / seconds);
     let slow = velocity.position().norm() <= FASTEST[0] && velocity.theta.abs() <= FASTEST[1];
     (steady && slow).then_some(velocity)
