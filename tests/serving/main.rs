@@ -292,6 +292,7 @@ async fn a_wildcard_asks_everything_and_commands_nothing() {
         "path",
         "pose",
         "slam/status",
+        "slam/tiles",
     ];
     assert_eq!(keys, names.map(|name| format!("{ROBOT}/{name}")));
     let refusals: Vec<&String> =
