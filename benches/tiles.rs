@@ -234,7 +234,7 @@ impl Robot {
         for message in &messages {
             let put = self.session.put(&key, message.clone());
             let put = put.congestion_control(CongestionControl::Drop);
-            put.priority(Priority::DataLow).await.expect("the session is open");
+            put.priority(Priority::Background).await.expect("the session is open");
         }
         size(&messages)
     }

@@ -21,8 +21,13 @@ fn simulation() -> Simulation {
     simulation
 }
 
-/// Root mean square distance of the beams' ends from where they truly were, m.
-fn error(simulation: &Simulation, readings: &[Reading], deskewed: bool) -> f64 {
+/// Root mean square distance of the beams' ends from where they truly were, m; `deskew` gets each
+/// scan and the velocity by odometry.
+fn error(
+    simulation: &Simulation,
+    readings: &[Reading],
+    deskew: impl Fn(&mut Scan, Velocity),
+) -> f64 {
     let (mut sum, mut count) = (0.0, 0_u32);
     let began = readings[0].stamp;
     for pair in readings.windows(2) {
@@ -30,9 +35,7 @@ fn error(simulation: &Simulation, readings: &[Reading], deskewed: bool) -> f64 {
         let seconds = next.stamp.seconds_since(reading.stamp);
         let motion = reading.odom_from_base.between(next.odom_from_base);
         let mut scan: Scan = reading.scan.clone();
-        if deskewed {
-            scan.geometry = scan.geometry.with_velocity(Velocity::of_motion(motion, seconds));
-        }
+        deskew(&mut scan, Velocity::of_motion(motion, seconds));
         let between_beams = SWEEP_S / (scan.ranges.len() - 1) as f64;
         let start_s = reading.stamp.seconds_since(began);
         for (index, range) in scan.ranges.iter().enumerate().filter(|(_, r)| r.is_finite()) {
@@ -55,7 +58,10 @@ fn errors(factor: f64) -> [f64; 2] {
     let mut simulation = simulation();
     simulation.odometry.factor = factor;
     let readings: Vec<Reading> = simulation.readings().take(1000).collect();
-    [false, true].map(|deskewed| error(&simulation, &readings, deskewed))
+    let deskew = |scan: &mut Scan, velocity| {
+        scan.geometry = scan.geometry.with_velocity(velocity);
+    };
+    [error(&simulation, &readings, |_, _| ()), error(&simulation, &readings, deskew)]
 }
 
 #[test]

@@ -94,9 +94,10 @@ impl Declare<'_> {
             .session
             .declare_publisher(key.clone())
             .encoding(Encoding::APPLICATION_OCTET_STREAM)
-            // What is dropped is asked for by those who miss it.
+            // What is dropped is asked for by those who miss it. A priority of its own: behind the
+            // map, which waits for its place, it would wait as well, for whoever does not read.
             .congestion_control(CongestionControl::Drop)
-            .priority(Priority::DataLow)
+            .priority(Priority::Background)
             .await;
         let publisher = Arc::new(declared(key, publisher)?);
         let output = TilesOutput { publisher, tiles, interval: settings.map_update_interval };

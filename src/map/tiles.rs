@@ -15,7 +15,7 @@ use sha2::{Digest as _, Sha256};
 use thiserror::Error;
 
 /// Cells along the side of a tile.
-pub const TILE_SIDE: usize = 128;
+pub const TILE_SIDE: usize = 64;
 /// Cells in a tile.
 pub const TILE_CELLS: usize = TILE_SIDE * TILE_SIDE;
 
@@ -424,17 +424,17 @@ mod tests {
         let noise: Vec<i8> = (0..TILE_CELLS).map(|_| rng.random()).collect();
         let data = compress(&noise);
         assert!(data.len() + HEAD + ENTRY < LARGEST_MESSAGE, "a tile fits whatever it holds");
-        let entries = (0..9).map(|tx| {
+        let entries = (0..40).map(|tx| {
             let index = TileIndex { ty: 0, tx };
             Entry { index, version: 1, hash: tile_hash(index, &noise), data: data.clone() }
         });
-        let packed = Message::pack(Head { side: 128, ..head() }, entries);
+        let packed = Message::pack(Head { side: TILE_SIDE as u16, ..head() }, entries);
         let messages: Vec<Message> =
             packed.iter().map(|bytes| Message::decode(bytes).unwrap()).collect();
         assert!(packed.len() > 2 && packed.iter().all(|bytes| bytes.len() <= LARGEST_MESSAGE));
         assert!(messages.iter().all(|message| usize::from(message.parts) == packed.len()));
         let columns = messages.iter().flat_map(|message| &message.entries).map(|e| e.index.tx);
-        assert_eq!(columns.collect::<Vec<_>>(), (0..9).collect::<Vec<_>>());
+        assert_eq!(columns.collect::<Vec<_>>(), (0..40).collect::<Vec<_>>());
     }
 
     #[test]

@@ -5,9 +5,12 @@ import math
 import struct
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
+UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
+ROS.register(get_types_from_msg(UPDATE_FIELDS, UPDATE))
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
 BEAMS = 180

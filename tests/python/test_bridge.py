@@ -31,7 +31,7 @@ FIRST_DOMAIN = 20 + os.getpid() % 80
 OUTPUTS = {
     "/map": MAP,
     "/map_metadata": "nav_msgs/msg/MapMetaData",
-    "/map_updates": "map_msgs/msg/OccupancyGridUpdate",
+    "/map_updates": rb.UPDATE,
     "/pose": POSE,
     "/particlecloud": "geometry_msgs/msg/PoseArray",
     "/path": PATH,

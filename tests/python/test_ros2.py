@@ -25,7 +25,7 @@ TOPICS = {
     "/tf_static": rb.TF,
     "/map": MAP,
     "/map_metadata": "nav_msgs/msg/MapMetaData",
-    "/map_updates": "map_msgs/msg/OccupancyGridUpdate",
+    "/map_updates": rb.UPDATE,
     "/path": PATH,
     "/pose": POSE,
     "/entropy": "std_msgs/msg/Float64",

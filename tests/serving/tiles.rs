@@ -65,7 +65,7 @@ async fn a_mirror_has_every_version_as_a_whole() {
     while let Ok(sample) = samples.try_recv() {
         let bytes = sample.payload().to_bytes();
         assert!(bytes.len() <= LARGEST_MESSAGE && Message::decode(&bytes).is_ok());
-        assert_eq!(sample.priority(), zenoh::qos::Priority::DataLow);
+        assert_eq!(sample.priority(), zenoh::qos::Priority::Background);
         assert_eq!(sample.congestion_control(), zenoh::qos::CongestionControl::Drop);
     }
 }
@@ -245,15 +245,13 @@ async fn a_client_that_does_not_read_slows_no_other() {
     let dead = open("client", Some(&locator(&rig.daemon).await)).await;
     let (hold, held) = std::sync::mpsc::channel::<()>();
     let held = std::sync::Mutex::new(held);
+    let (tell, mut told) = unbounded_channel();
     let stuck = move |_| {
+        tell.send(()).ok();
         held.lock().unwrap().recv().ok();
     };
     dead.declare_subscriber(format!("{ROBOT}/**")).callback(stuck).background().await.unwrap();
-    let probe = rig.daemon.declare_publisher(format!("{ROBOT}/probe")).await.unwrap();
-    let matching = probe.matching_listener().await.unwrap();
-    while !probe.matching_status().await.unwrap().matching() {
-        matching.recv_async().await.unwrap();
-    }
+    next(&mut told).await;
     let mirror = follow(&rig.client).await;
     until(&mirror, has(&drive[0])).await;
     for snapshot in drive.iter().cycle().skip(1).take(100).enumerate().map(numbered) {

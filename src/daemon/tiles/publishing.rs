@@ -6,7 +6,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tokio::sync::watch;
 use tokio::task::spawn_blocking;
-use tokio::time::{Instant, MissedTickBehavior};
+use tokio::time::MissedTickBehavior;
 use zenoh::Wait as _;
 use zenoh::pubsub::Publisher;
 
@@ -44,7 +44,7 @@ impl TilesOutput {
                     if newest != seen {
                         seen = newest;
                         told = self.tell_changes(told).await;
-                        rest.as_mut().reset(Instant::now() + self.interval);
+                        rest.set(tokio::time::sleep(self.interval));
                         digests.reset();
                     }
                 }
