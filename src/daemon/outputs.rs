@@ -195,7 +195,9 @@ impl Declare<'_> {
         Ok(())
     }
 
-    /// A publisher of small messages; of those that do not fit, the newest is dropped.
+    /// A publisher of small messages; of those that do not fit, the newest is dropped. No message
+    /// that waits for its place has their priority: they would wait behind it for a client that
+    /// does not read.
     async fn plain(
         &mut self,
         name: &'static str,
@@ -204,7 +206,8 @@ impl Declare<'_> {
         let output = self.node.output(name, wire_type, Qos::reliable(10))?;
         let Output { key, encoding, signature } = output;
         let publisher = self.session.declare_publisher(key.clone()).encoding(encoding);
-        let publisher = publisher.congestion_control(CongestionControl::Drop).await;
+        let publisher = publisher.congestion_control(CongestionControl::Drop);
+        let publisher = publisher.priority(Priority::InteractiveLow).await;
         Ok(MessagePublisher { name, publisher: declared(key, publisher)?, signature })
     }
 
