@@ -342,23 +342,29 @@ async fn the_map_is_that_of_a_replay_however_messages_are_written() {
     }
 }
 
-/// What `gmapd replay` makes of the moments along their odometry as poses in the map.
-fn along(moments: &[Moment], deskewed: bool) -> (Option<OccupancyGrid>, Path) {
+/// What `gmapd replay` makes of the moments along their odometry as poses in the map, with the
+/// motion during each sweep that `motion` tells.
+fn along(
+    moments: &[Moment],
+    motion: impl Fn(usize) -> Option<Pose2>,
+) -> (Option<OccupancyGrid>, Path) {
     let mut replay = Replay::new(&settings(&["engine=known_poses"]).config, 1).unwrap();
     for (index, moment) in moments.iter().enumerate() {
         let (mut scan, odom_from_base) = (moment.scan(), moment.odom_from_base());
-        if deskewed {
-            let Some(next) = moments.get(index + 1) else { continue };
-            let motion = odom_from_base.between(next.odom_from_base());
-            let increment = SWEEP_S / (scan.ranges.len() - 1) as f64;
-            let timed = scan.geometry.with_time_increment(increment);
-            scan.geometry = timed.with_velocity(Velocity::of_motion(motion, SWEEP_S));
-        }
+        let Some(motion) = motion(index) else { continue };
+        let increment = SWEEP_S / (scan.ranges.len() - 1) as f64;
+        let timed = scan.geometry.with_time_increment(increment);
+        scan.geometry = timed.with_velocity(Velocity::of_motion(motion, SWEEP_S));
         let (stamp, mount) = (scan.stamp, mount());
-        replay.add_received(&Reading { line: 1, stamp, odom_from_base, scan: Some(scan), mount });
+        let scan = Some(scan);
+        replay.add_received(&Reading { line: 1, stamp, odom_from_base, scan, mount });
     }
     let outcome = replay.finish();
     (outcome.map, outcome.path)
+}
+
+fn at_once(_: usize) -> Option<Pose2> {
+    Some(Pose2::IDENTITY)
 }
 
 /// The time between two moments.
@@ -380,7 +386,7 @@ async fn given_poses_as_messages_or_transforms_give_the_same_map() {
         Transform,
     }
     let moments = drive(40);
-    let (map, way) = along(&moments, false);
+    let (map, way) = along(&moments, at_once);
     assert_eq!(way.len(), 40);
     for (form, wire) in [
         (Form::Stamped, Wire::LittleEndian),
@@ -472,8 +478,12 @@ async fn the_beams_of_a_sweep_are_moved_to_where_its_first_was_taken() {
         let intervals = (moment.scan.ranges.len() - 1) as f64;
         moment.scan.time_increment = (SWEEP_S / intervals) as f32;
     }
-    let skewed = along(&moments, false).0.unwrap();
-    let expected = along(&moments, true).0.unwrap();
+    let skewed = along(&moments, at_once).0.unwrap();
+    let motion = |index: usize| {
+        let (now, next) = (moments.get(index)?, moments.get(index + 1)?);
+        Some(now.odom_from_base().between(next.odom_from_base()))
+    };
+    let expected = along(&moments, motion).0.unwrap();
     let mut rig = Rig::mounted(&["engine=known_poses", "odometry_timeout_s=5"]).await;
     rig.robot.put(&rig.robot.odom, &moments[0].pose_in("map")).await;
     for pair in moments.windows(2) {

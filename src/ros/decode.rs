@@ -106,7 +106,7 @@ pub fn decode_pose(bytes: &[u8], encoding: &str) -> Result<PoseStamped, DecodeEr
         Ok(PoseWithCovarianceStamped { header, pose }) => {
             Ok(PoseStamped { header, pose: pose.pose })
         }
-        Err(error) => decode(bytes, encoding).map_err(|_| error),
+        Err(error) => decode(bytes, encoding).or(Err(error)),
     }
 }
 
