@@ -14,6 +14,7 @@ pub mod input;
 mod judgement;
 pub mod keys;
 pub mod ledger;
+pub mod limits;
 pub mod mailbox;
 mod map_updates;
 pub mod mapper;
@@ -239,7 +240,7 @@ impl Daemon {
     /// All threads and tasks of a daemon that hears and tells nothing yet.
     fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
         let saving = Saving::new(config)?;
-        let inbox = Arc::new(Inbox::default());
+        let inbox = Arc::new(Inbox::new(config.raw.max_message_bytes));
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
         let (snapshot_sender, snapshots) = watch::channel(Arc::new(mapper::first_snapshot()));
