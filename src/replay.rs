@@ -162,7 +162,7 @@ impl Replay {
 }
 
 /// A pose that no message can carry is left to the filter to refuse.
-fn odometry_as_received(reading: &Reading) -> Pose2 {
+pub(crate) fn odometry_as_received(reading: &Reading) -> Pose2 {
     let sample = OdometrySample {
         stamp: reading.stamp,
         odom_frame: String::new(),
