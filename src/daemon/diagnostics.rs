@@ -61,6 +61,7 @@ mod tests {
 
     fn status(state: State) -> Status {
         Status {
+            engine: crate::config::EngineKind::Gmapping,
             version: "0.0.0",
             uptime_s: 1.0,
             state,

@@ -260,7 +260,7 @@ impl Daemon {
             gauges,
             snapshots: snapshots.clone(),
         };
-        let status = Arc::new(StatusSource::new(keys.clone(), config.raw.seed, shared));
+        let status = Arc::new(StatusSource::new(keys.clone(), &config.raw, shared));
         let (commands, requests) = mpsc::channel(COMMANDS);
         let helpers = [
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),

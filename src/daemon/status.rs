@@ -16,6 +16,7 @@ use super::mapper::Gauges;
 use super::snapshot::{MapVersion, Snapshot, State};
 use super::synchronizer::Channel;
 use crate::clock;
+use crate::config::{EngineKind, RawConfig};
 use crate::slam::pose::Pose2;
 use crate::slam::update::WeakDirection;
 use crate::statistics::Spread;
@@ -26,6 +27,8 @@ use crate::timeline::TimelineCounts;
 pub struct Status {
     /// Of gmapd.
     pub version: &'static str,
+    /// What maps.
+    pub engine: EngineKind,
     /// Seconds since the daemon started.
     pub uptime_s: f64,
     /// In one word.
@@ -120,6 +123,7 @@ pub struct MapStatus {
 pub struct StatusSource {
     started: Instant,
     keys: InputKeys,
+    engine: EngineKind,
     seed: u64,
     inbox: Arc<Inbox>,
     mailbox: Arc<Mailbox>,
@@ -139,10 +143,11 @@ pub(super) struct Shared {
 }
 
 impl StatusSource {
-    pub(super) fn new(keys: InputKeys, seed: u64, shared: Shared) -> Self {
+    pub(super) fn new(keys: InputKeys, config: &RawConfig, shared: Shared) -> Self {
         let Shared { inbox, mailbox, gauges, snapshots } = shared;
+        let &RawConfig { engine, seed, .. } = config;
         let (started, map) = (clock::now(), Mutex::default());
-        Self { started, keys, seed, inbox, mailbox, gauges, snapshots, map }
+        Self { started, keys, engine, seed, inbox, mailbox, gauges, snapshots, map }
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -194,6 +199,7 @@ impl StatusSource {
             filter: filter_status(&snapshot, &gauges),
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
             peak_memory_bytes: clock::peak_resident_memory(),
+            engine: self.engine,
             seed: self.seed,
         }
     }

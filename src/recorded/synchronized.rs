@@ -13,7 +13,6 @@ use crate::daemon::synchronizer::{
     self, Call, Channel, FramedScan, Need, ReadyScan, Refusal, Sought, Synchronizer,
 };
 use crate::logs::{LogError, Reading};
-use crate::replay::odometry_as_received;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
 use crate::tf;
@@ -184,8 +183,8 @@ impl<I: Iterator<Item = Result<Reading, LogError>>> Sweeps<I> {
     fn take(&mut self, reading: &Reading) {
         let Reading { line, stamp, .. } = *reading;
         self.synchronized.advance(line, stamp);
-        let odometry = (stamp, odometry_as_received(reading));
-        self.synchronized.odometry(Channel::Messages, odometry);
+        let odom_from_base = convert::odometry_as_received(stamp, reading.odom_from_base);
+        self.synchronized.odometry(Channel::Messages, (stamp, odom_from_base));
         let Some(scan) = &reading.scan else { return };
         self.sit(&reading.mount);
         match convert::scan(convert::laser_scan(scan, LASER)) {

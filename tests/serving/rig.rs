@@ -5,7 +5,7 @@ use std::fmt::Debug;
 use std::sync::Arc;
 use std::time::Duration;
 
-use gmapd::config::Config;
+use gmapd::config::{Config, EngineKind};
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::ledger::{Entry, Ledger};
@@ -108,6 +108,7 @@ pub(crate) fn nothing() -> Snapshot {
 fn status() -> Status {
     Status {
         version: "1.2.3",
+        engine: EngineKind::Gmapping,
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
         detail: "odometry is missing".to_owned(),
