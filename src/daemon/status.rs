@@ -11,6 +11,7 @@ use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
 use super::keys::InputKeys;
 use super::ledger::Verdict;
+use super::links::{Links, LinksStatus};
 use super::mailbox::Mailbox;
 use super::mapper::Gauges;
 use super::snapshot::{MapVersion, Snapshot, State};
@@ -31,6 +32,8 @@ pub struct Status {
     pub engine: EngineKind,
     /// Seconds since the daemon started.
     pub uptime_s: f64,
+    /// The session's links.
+    pub links: LinksStatus,
     /// In one word.
     pub state: State,
     /// In a sentence, with what to do where something is wrong.
@@ -129,6 +132,7 @@ pub struct StatusSource {
     mailbox: Arc<Mailbox>,
     gauges: Arc<Mutex<Gauges>>,
     snapshots: watch::Receiver<Arc<Snapshot>>,
+    links: Arc<Links>,
     /// Of the version of the map that was asked for last.
     map: Mutex<Option<MapStatus>>,
 }
@@ -140,14 +144,15 @@ pub(super) struct Shared {
     pub(super) mailbox: Arc<Mailbox>,
     pub(super) gauges: Arc<Mutex<Gauges>>,
     pub(super) snapshots: watch::Receiver<Arc<Snapshot>>,
+    pub(super) links: Arc<Links>,
 }
 
 impl StatusSource {
     pub(super) fn new(keys: InputKeys, config: &RawConfig, shared: Shared) -> Self {
-        let Shared { inbox, mailbox, gauges, snapshots } = shared;
+        let Shared { inbox, mailbox, gauges, snapshots, links } = shared;
         let &RawConfig { engine, seed, .. } = config;
         let (started, map) = (clock::now(), Mutex::default());
-        Self { started, keys, engine, seed, inbox, mailbox, gauges, snapshots, map }
+        Self { started, keys, engine, seed, inbox, mailbox, gauges, snapshots, links, map }
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -200,6 +205,7 @@ impl StatusSource {
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
             peak_memory_bytes: clock::peak_resident_memory(),
             engine: self.engine,
+            links: self.links.status(),
             seed: self.seed,
         }
     }

@@ -10,6 +10,7 @@ use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::ledger::{Entry, Ledger};
 use gmapd::daemon::limits::Limits;
+use gmapd::daemon::links::LinksStatus;
 use gmapd::daemon::ros_node::{Convention, RosNode};
 use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
 use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
@@ -109,6 +110,7 @@ fn status() -> Status {
     Status {
         version: "1.2.3",
         engine: EngineKind::Gmapping,
+        links: LinksStatus::default(),
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
         detail: "odometry is missing".to_owned(),
