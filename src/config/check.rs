@@ -187,6 +187,9 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("occ_thresh", raw.occupied_threshold, Between(0.0, 1.0)),
         ("odometry_timeout_s", raw.odometry_timeout_s, Between(0.01, 5.0)),
         ("scan_queue", raw.scan_queue as f64, Between(1.0, 1000.0)),
+        ("checkpoint", raw.checkpoint.every_s, Between(0.1, 86_400.0)),
+        ("checkpoint", raw.checkpoint.every_scans as f64, AtLeast(1.0)),
+        ("checkpoint", raw.checkpoint.keep as f64, Between(1.0, 1000.0)),
         ("ros_domain_id", f64::from(raw.ros_domain_id), Between(0.0, 232.0)),
     ];
     let optional = [
