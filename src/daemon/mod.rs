@@ -6,6 +6,7 @@
 //! From these [`serving`] publishes and answers.
 
 mod answers;
+pub mod checkpointing;
 pub mod command;
 mod diagnostics;
 pub mod formats;
@@ -43,6 +44,7 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
+use self::checkpointing::CheckpointsError;
 use self::command::Request;
 use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
@@ -107,6 +109,9 @@ pub enum DaemonError {
     /// The filter's threads do not start.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
+    /// The state cannot be kept.
+    #[error("state: {0}")]
+    Checkpoints(#[from] CheckpointsError),
     /// The thread `mapper` does not start.
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
@@ -220,9 +225,9 @@ impl Daemon {
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
         let convention = Convention::new(&config.raw);
-        let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
+        let mut node = RosNode::new(session.zid().to_string(), prefix.clone(), convention);
         let keys = node.inputs(&config.raw.keys, Input::of_motion(&config))?;
-        let mut daemon = Self::deaf(&config, &keys, threads)?;
+        let mut daemon = Self::deaf(&config, &prefix, &keys, threads)?;
         let sources = Sources {
             snapshots: daemon.snapshots(),
             verdicts: daemon.verdicts(),
@@ -237,7 +242,12 @@ impl Daemon {
     }
 
     /// All threads and tasks of a daemon that hears and tells nothing yet.
-    fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
+    fn deaf(
+        config: &Config,
+        prefix: &Prefix,
+        keys: &InputKeys,
+        threads: usize,
+    ) -> Result<Self, DaemonError> {
         let saving = Saving::new(config)?;
         let inbox = Arc::new(Inbox::default());
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
@@ -251,13 +261,16 @@ impl Daemon {
             verdicts: verdicts.clone(),
             gauges: Arc::clone(&gauges),
         };
-        let mapper = spawn(Mapper::new(connections, config, keys, threads)?)?;
+        let mut mapper = Mapper::new(connections, config, keys, threads)?;
+        let checkpoints = checkpointing::attach(&mut mapper, config, prefix)?;
+        let mapper = spawn(mapper)?;
         let decoder = tokio::spawn(input::decode(Arc::clone(&inbox), Arc::clone(&mailbox)));
         let shared = Shared {
             inbox: Arc::clone(&inbox),
             mailbox: Arc::clone(&mailbox),
             gauges,
             snapshots: snapshots.clone(),
+            checkpoints,
         };
         let status = Arc::new(StatusSource::new(keys.clone(), config.raw.seed, shared));
         let (commands, requests) = mpsc::channel(COMMANDS);

@@ -65,11 +65,13 @@ pub enum Topic {
     InitialPose,
     /// Write the map to files.
     Save,
+    /// Write the state, to go on from.
+    Checkpoint,
 }
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -84,6 +86,7 @@ impl Topic {
         Self::Resume,
         Self::InitialPose,
         Self::Save,
+        Self::Checkpoint,
     ];
 
     /// The key under the robot's prefix.
@@ -104,13 +107,22 @@ impl Topic {
             Self::Resume => "slam/cmd/resume",
             Self::InitialPose => "slam/cmd/initial_pose",
             Self::Save => "slam/cmd/save",
+            Self::Checkpoint => "slam/cmd/checkpoint",
         }
     }
 
     /// Whether asking changes something, so that it must not happen by a wildcard.
     #[must_use]
     pub const fn is_command(self) -> bool {
-        matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::InitialPose | Self::Save)
+        matches!(
+            self,
+            Self::Reset
+                | Self::Pause
+                | Self::Resume
+                | Self::InitialPose
+                | Self::Save
+                | Self::Checkpoint
+        )
     }
 
     /// Whether the answer may be megabytes, which take their time on the network.
@@ -155,6 +167,7 @@ impl Topic {
                 let name = parameters.get("name").map(SaveName::parse).transpose()?;
                 Question::Save(name.unwrap_or_default())
             }
+            Self::Checkpoint => of(&[]).map(|_| Question::Checkpoint)?,
         })
     }
 }
@@ -197,6 +210,8 @@ pub enum Question {
     InitialPose(Pose2),
     /// Write the map to files of this name.
     Save(SaveName),
+    /// Write the state, to go on from.
+    Checkpoint,
 }
 
 /// Which part of the map is asked for, and what of it.
@@ -586,6 +601,7 @@ mod tests {
         assert_eq!(asked(Topic::Status), Ok(Question::Status));
         assert_eq!(asked(Topic::Reset), Ok(Question::Reset(None)));
         assert_eq!(asked(Topic::Pause), Ok(Question::Pause));
+        assert_eq!(asked(Topic::Checkpoint), Ok(Question::Checkpoint));
         assert_eq!(asked(Topic::Resume), Ok(Question::Resume));
         assert_eq!(asked(Topic::InitialPose), Err(SelectorError::NoPose));
         assert_eq!(asked(Topic::Save), Ok(Question::Save(SaveName::default())));

@@ -7,6 +7,7 @@ use std::time::Instant;
 use serde::Serialize;
 use tokio::sync::watch;
 
+use super::checkpointing::{CheckpointStatus, SharedStatus};
 use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
 use super::keys::InputKeys;
@@ -50,6 +51,8 @@ pub struct Status {
     pub filter: FilterStatus,
     /// The map that is handed out; `null` before the first.
     pub map: Option<MapStatus>,
+    /// The state on disk; `null` if it is not kept.
+    pub checkpoint: Option<CheckpointStatus>,
     /// The most memory the process has had resident, bytes.
     pub peak_memory_bytes: Option<u64>,
     /// Seed of the random numbers.
@@ -125,6 +128,7 @@ pub struct StatusSource {
     mailbox: Arc<Mailbox>,
     gauges: Arc<Mutex<Gauges>>,
     snapshots: watch::Receiver<Arc<Snapshot>>,
+    checkpoints: Option<SharedStatus>,
     /// Of the version of the map that was asked for last.
     map: Mutex<Option<MapStatus>>,
 }
@@ -136,13 +140,14 @@ pub(super) struct Shared {
     pub(super) mailbox: Arc<Mailbox>,
     pub(super) gauges: Arc<Mutex<Gauges>>,
     pub(super) snapshots: watch::Receiver<Arc<Snapshot>>,
+    pub(super) checkpoints: Option<SharedStatus>,
 }
 
 impl StatusSource {
     pub(super) fn new(keys: InputKeys, seed: u64, shared: Shared) -> Self {
-        let Shared { inbox, mailbox, gauges, snapshots } = shared;
+        let Shared { inbox, mailbox, gauges, snapshots, checkpoints } = shared;
         let (started, map) = (clock::now(), Mutex::default());
-        Self { started, keys, seed, inbox, mailbox, gauges, snapshots, map }
+        Self { started, keys, seed, inbox, mailbox, gauges, snapshots, checkpoints, map }
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -193,6 +198,7 @@ impl StatusSource {
             scans_waiting: self.mailbox.scans() + gauges.scans_waiting,
             filter: filter_status(&snapshot, &gauges),
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
+            checkpoint: self.checkpoints.as_ref().map(told),
             peak_memory_bytes: clock::peak_resident_memory(),
             seed: self.seed,
         }
@@ -257,6 +263,10 @@ impl MapStatus {
             scans,
         }
     }
+}
+
+fn told(checkpoints: &SharedStatus) -> CheckpointStatus {
+    checkpoints.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
 fn with_counts(status: InputStatus, counts: TimelineCounts) -> InputStatus {

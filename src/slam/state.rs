@@ -52,7 +52,10 @@ pub enum StateError {
 }
 
 /// An error unless `fits` holds of the parts.
-pub(super) fn ensure(fits: bool, parts: &'static str) -> Result<(), StateError> {
+///
+/// # Errors
+/// Names the parts.
+pub fn ensure(fits: bool, parts: &'static str) -> Result<(), StateError> {
     if fits { Ok(()) } else { Err(StateError::Unsound(parts)) }
 }
 
