@@ -160,6 +160,31 @@ pub fn odometry_message(sample: &OdometrySample) -> ros::Odometry {
     }
 }
 
+/// Where the base is, as somebody else has found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FramedPose {
+    /// When.
+    pub stamp: Stamp,
+    /// The frame that it is in.
+    pub frame: String,
+    /// The base in that frame.
+    pub frame_from_base: Pose2,
+}
+
+/// A given pose, flattened like odometry.
+///
+/// # Errors
+/// When its stamp, position or rotation is unusable.
+pub fn stamped_pose(message: ros::PoseStamped) -> Result<FramedPose, ConvertError> {
+    let ros::Pose { position, orientation } = message.pose;
+    let frame_from_base = isometry([position.x, position.y, position.z], orientation)?;
+    Ok(FramedPose {
+        stamp: stamp(message.header.stamp)?,
+        frame: message.header.frame_id,
+        frame_from_base: base_pose(&frame_from_base)?,
+    })
+}
+
 /// The transform between two frames.
 ///
 /// # Errors

@@ -21,7 +21,7 @@ use crate::convert;
 use crate::daemon::frames::{FrameNames, Frames};
 use crate::daemon::ledger::Verdict;
 use crate::daemon::synchronizer::{
-    self, Call, Channel, FramedScan, Need, ReadyScan, Refusal, Synchronizer,
+    self, Call, Channel, FramedScan, Need, ReadyScan, Refusal, Sought, Synchronizer,
 };
 use crate::logs::recording::{Kind, Message, Messages, RawMessage, Recording, RecordingError};
 use crate::logs::{Fault, LogStatistics, Reading};
@@ -124,6 +124,7 @@ impl Recorded {
             most_waiting: raw.scan_queue,
             sweep_time_s: raw.sweep_time_s,
             source: self.topics.source,
+            sought: Sought::Odometry,
             need: Need::Required,
             odom_key,
             tf_path: format!("{} (from `{odom}` to `{base}`)", transforms.join(", ")),

@@ -18,6 +18,7 @@ use gmapd::logs::Reading;
 use gmapd::replay::Replay;
 use gmapd::ros::{self, Message};
 use gmapd::sim::{Place, Scenario, Simulation};
+use gmapd::slam::deskew::Velocity;
 use gmapd::slam::gmapping::{GMapping, ScanReading};
 use gmapd::slam::grid::occupancy::OccupancyGrid;
 use gmapd::slam::path::Path;
@@ -192,8 +193,8 @@ struct Robot {
 }
 
 impl Robot {
-    /// Ready when the daemon listens.
-    async fn start(session: &Session, wire: Wire) -> Self {
+    /// Ready when the daemon listens, to odometry or poses on the key `motion`.
+    async fn start(session: &Session, wire: Wire, motion: &str) -> Self {
         let publisher = async |name: &str| {
             let publisher = session.declare_publisher(format!("{ROBOT}/{name}"));
             let publisher = publisher.congestion_control(CongestionControl::Block).await.unwrap();
@@ -203,7 +204,7 @@ impl Robot {
         Self {
             wire,
             scan: publisher("scan").await,
-            odom: publisher("odom").await,
+            odom: publisher(motion).await,
             tf: publisher("tf").await,
             tf_static: publisher("tf_static").await,
         }
@@ -250,9 +251,10 @@ impl Rig {
     async fn start(settings: Settings, wire: Wire) -> Self {
         let (session, locator) = listening().await;
         let far = connected(&locator).await;
+        let motion = if settings.config.takes_pose_messages() { "amcl_pose" } else { "odom" };
         let daemon = Daemon::start(&session, settings).await.unwrap();
         let verdicts = daemon.verdicts();
-        let robot = Robot::start(&far, wire).await;
+        let robot = Robot::start(&far, wire, motion).await;
         Self { daemon, verdicts, robot, sessions: [session, far] }
     }
 
@@ -338,6 +340,166 @@ async fn the_map_is_that_of_a_replay_however_messages_are_written() {
         assert_eq!(grid(&snapshot), map, "{wire:?}");
         assert_eq!(snapshot.ledger.count(Verdict::Processed), way.len() as u64);
     }
+}
+
+/// What `gmapd replay` makes of the moments along their odometry as poses in the map, with the
+/// motion during each sweep that `motion` tells.
+fn along(
+    moments: &[Moment],
+    motion: impl Fn(usize) -> Option<Pose2>,
+) -> (Option<OccupancyGrid>, Path) {
+    let mut replay = Replay::new(&settings(&["engine=known_poses"]).config, 1).unwrap();
+    for (index, moment) in moments.iter().enumerate() {
+        let (mut scan, odom_from_base) = (moment.scan(), moment.odom_from_base());
+        let Some(motion) = motion(index) else { continue };
+        let increment = SWEEP_S / (scan.ranges.len() - 1) as f64;
+        let timed = scan.geometry.with_time_increment(increment);
+        scan.geometry = timed.with_velocity(Velocity::of_motion(motion, SWEEP_S));
+        let (stamp, mount) = (scan.stamp, mount());
+        let scan = Some(scan);
+        replay.add_received(&Reading { line: 1, stamp, odom_from_base, scan, mount });
+    }
+    let outcome = replay.finish();
+    (outcome.map, outcome.path)
+}
+
+fn at_once(_: usize) -> Option<Pose2> {
+    Some(Pose2::IDENTITY)
+}
+
+/// The time between two moments.
+const SWEEP_S: f64 = 0.1;
+
+impl Moment {
+    fn pose_in(&self, frame: &str) -> ros::PoseStamped {
+        let header = ros::Header { frame_id: frame.to_owned(), ..self.odometry.header.clone() };
+        ros::PoseStamped { header, pose: self.odometry.pose.pose }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn given_poses_as_messages_or_transforms_give_the_same_map() {
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    enum Form {
+        Stamped,
+        WithCovariance,
+        Transform,
+    }
+    let moments = drive(40);
+    let (map, way) = along(&moments, at_once);
+    assert_eq!(way.len(), 40);
+    for (form, wire) in [
+        (Form::Stamped, Wire::LittleEndian),
+        (Form::Stamped, Wire::Json),
+        (Form::WithCovariance, Wire::LittleEndian),
+        (Form::WithCovariance, Wire::Json),
+        (Form::Transform, Wire::LittleEndian),
+    ] {
+        let mut rig = Rig::start(settings(&["engine=known_poses"]), wire).await;
+        rig.robot.mount(BASE_FROM_LASER).await;
+        for moment in &moments {
+            let ros::PoseStamped { header, pose } = moment.pose_in("map");
+            match form {
+                Form::Stamped => rig.robot.put(&rig.robot.odom, &moment.pose_in("map")).await,
+                Form::WithCovariance => {
+                    let pose =
+                        ros::PoseWithCovariance { pose, ..ros::PoseWithCovariance::default() };
+                    let message = ros::PoseWithCovarianceStamped { header, pose };
+                    rig.robot.put(&rig.robot.odom, &message).await;
+                }
+                Form::Transform => {
+                    let mut message = moment.transform();
+                    message.transforms[0].header = header;
+                    rig.robot.put(&rig.robot.tf, &message).await;
+                }
+            }
+            rig.robot.scan(moment).await;
+            assert_eq!(rig.verdict().await.verdict, Verdict::Processed, "{form:?} {wire:?}");
+        }
+        let status = rig.daemon.status();
+        let came = if form == Form::Transform { "tf" } else { "pose" };
+        assert_eq!(status.inputs[came].received, 40);
+        assert!(!status.inputs.contains_key("odom"));
+        let snapshot = rig.end().await;
+        assert_eq!(path(&snapshot), way, "{form:?} {wire:?}");
+        assert_eq!(grid(&snapshot), map, "{form:?} {wire:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scan_waits_for_its_pose_and_says_how_much_was_missing() {
+    let moments = drive(4);
+    let mut rig = Rig::mounted(&["engine=known_poses", "odometry_timeout_s=0.05"]).await;
+    // In another frame it says nothing of the map.
+    rig.robot.put(&rig.robot.odom, &moments[0].pose_in("odom")).await;
+    rig.robot.scan(&moments[0]).await;
+    let entry = rig.verdict().await;
+    assert_eq!(entry.verdict, Verdict::NoOdometry);
+    let expected = "no given pose has come on robot01/amcl_pose or in robot01/tf (from `map`";
+    assert!(entry.detail.starts_with(expected), "{}", entry.detail);
+    rig.robot.put(&rig.robot.odom, &moments[1].pose_in("map")).await;
+    rig.robot.scan(&moments[3]).await;
+    let entry = rig.verdict().await;
+    assert!(entry.detail.starts_with("a given pose is missing by 200.0 ms"), "{}", entry.detail);
+    let pose = &rig.daemon.status().inputs["pose"];
+    assert_eq!((pose.received, pose.rejected), (2, 1));
+    let reason = pose.last_rejection.as_deref();
+    assert_eq!(reason, Some("it is a pose in `odom`, and not in `map`"));
+    rig.end().await;
+}
+
+/// The share of the cells known in either that are not the same in both.
+fn difference(a: &OccupancyGrid, b: &OccupancyGrid) -> f64 {
+    let at = |grid: &OccupancyGrid, x: i64, y: i64| {
+        let column = x - (grid.origin.x / grid.resolution).round() as i64;
+        let row = y - (grid.origin.y / grid.resolution).round() as i64;
+        let inside = 0..grid.width as i64;
+        if inside.contains(&column) && (0..grid.height as i64).contains(&row) {
+            grid.cells[row as usize * grid.width + column as usize]
+        } else {
+            -1
+        }
+    };
+    let (mut known, mut other) = (0, 0);
+    for y in -1000..1000 {
+        for x in -1000..1000 {
+            let (a, b) = (at(a, x, y), at(b, x, y));
+            known += u32::from(a >= 0 || b >= 0);
+            other += u32::from(a != b);
+        }
+    }
+    f64::from(other) / f64::from(known)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_beams_of_a_sweep_are_moved_to_where_its_first_was_taken() {
+    let mut moments = drive(60);
+    for moment in &mut moments {
+        let intervals = (moment.scan.ranges.len() - 1) as f64;
+        moment.scan.time_increment = (SWEEP_S / intervals) as f32;
+    }
+    let skewed = along(&moments, at_once).0.unwrap();
+    let motion = |index: usize| {
+        let (now, next) = (moments.get(index)?, moments.get(index + 1)?);
+        Some(now.odom_from_base().between(next.odom_from_base()))
+    };
+    let expected = along(&moments, motion).0.unwrap();
+    let mut rig = Rig::mounted(&["engine=known_poses", "odometry_timeout_s=5"]).await;
+    rig.robot.put(&rig.robot.odom, &moments[0].pose_in("map")).await;
+    for pair in moments.windows(2) {
+        rig.robot.scan(&pair[0]).await;
+        let mut pose = pair[1].pose_in("map");
+        rig.robot.put(&rig.robot.odom, &pose).await;
+        // A digit of time_increment may put the end of the sweep after that.
+        pose.header.stamp.nanosec += 1000;
+        rig.robot.put(&rig.robot.odom, &pose).await;
+        assert_eq!(rig.verdict().await.verdict, Verdict::Processed);
+    }
+    let found = grid(&*rig.end().await).unwrap();
+    let (right, wrong) = (difference(&found, &expected), difference(&found, &skewed));
+    eprintln!("{right:.5} of the cells differ; as taken {wrong:.5}");
+    assert!(right < 0.002, "{right}");
+    assert!(wrong > 10.0 * right && wrong > 0.01, "{wrong}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -641,7 +803,7 @@ async fn static_transforms_told_before_the_daemon_started_reach_it() {
     let set = ["odometry_timeout_s=5"];
     let daemon = Daemon::start(&session, settings(&set)).await.unwrap();
     let mut verdicts = daemon.verdicts();
-    let robot = Robot::start(&far, Wire::LittleEndian).await;
+    let robot = Robot::start(&far, Wire::LittleEndian, "odom").await;
     let moments = drive(1);
     robot.odometry(&moments[0]).await;
     robot.scan(&moments[0]).await;
@@ -658,7 +820,7 @@ async fn the_daemon_runs_until_it_is_told_to_end() {
     let (end, ended) = oneshot::channel::<()>();
     let shutdown = async move { ended.await.unwrap_or_default() };
     let running = tokio::spawn(daemon::run(session, settings(&[]), shutdown));
-    let robot = Robot::start(&far, Wire::LittleEndian).await;
+    let robot = Robot::start(&far, Wire::LittleEndian, "odom").await;
     robot.mount(BASE_FROM_LASER).await;
     end.send(()).unwrap();
     let ended = tokio::time::timeout(Duration::from_secs(2), running).await;
@@ -741,7 +903,7 @@ async fn the_program_ends_while_nobody_answers_where_it_connects() {
 async fn the_program_maps_and_ends_with_exit_code_zero_within_two_seconds() {
     let (session, locator) = listening().await;
     let mut program = Program::start(&locator, "warn,gmapd=debug");
-    let robot = Robot::start(&session, Wire::LittleEndian).await;
+    let robot = Robot::start(&session, Wire::LittleEndian, "odom").await;
     robot.mount(BASE_FROM_LASER).await;
     for moment in drive(30) {
         robot.odometry(&moment).await;

@@ -82,7 +82,9 @@ async fn input_keys(session: &Session, robot: &Prefix) -> anyhow::Result<InputKe
     };
     let mut status: Status = serde_json::from_slice(&answer.bytes)
         .with_context(|| format!("what answers on {status} is no gmapd"))?;
+    let poses = status.inputs.contains_key(Input::Pose.name());
+    let motion = if poses { Input::Pose } else { Input::Odom };
     // An input that an older daemon does not have leaves an empty key, which is an error.
     let key = |input: Input| status.inputs.remove(input.name()).unwrap_or_default().key;
-    Ok(InputKeys::parse(Input::ALL.map(key))?)
+    Ok(InputKeys::parse(motion, key)?)
 }

@@ -193,6 +193,7 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("maxRange", raw.max_range, Positive),
         ("maxUrange", raw.max_usable_range, Positive),
         ("tf_delay", raw.tf_delay, Finite),
+        ("occ_min_visits", raw.occupied_min_visits.map(f64::from), Between(1.0, 1000.0)),
         ("sweep_time_s", raw.sweep_time_s, Between(0.0, 1.0)),
     ];
     limits.extend(optional.into_iter().filter_map(|(key, value, of)| Some((key, value?, of))));

@@ -22,6 +22,7 @@ use crate::slam::engine::EngineParameters;
 use crate::slam::gmapping::{
     MapParameters, MatcherKind, MatcherParameters, Parameters, WeightSmoothing, Weighting,
 };
+use crate::slam::grid::occupancy::OccupiedThreshold;
 use crate::slam::hector;
 use crate::slam::known_poses::{self, MapExtent};
 use crate::slam::motion_gate::MotionGate;
@@ -85,7 +86,7 @@ impl Config {
                 MapOf::AllScans => MapExtent::AllScans,
                 MapOf::NewestScan => MapExtent::NewestScan,
             },
-            occupied_threshold: raw.occupied_threshold,
+            occupied_threshold: occupied_threshold(raw),
         }
     }
 
@@ -142,7 +143,7 @@ impl Config {
                 resample_threshold: raw.resample_threshold,
             },
             map: MapParameters {
-                occupied_threshold: raw.occupied_threshold,
+                occupied_threshold: occupied_threshold(raw),
                 free_on_no_return: raw.free_on_no_return,
             },
         }
@@ -165,6 +166,13 @@ impl Config {
         config
     }
 
+    /// Whether given poses come as messages on `keys: pose`, in place of odometry's.
+    #[must_use]
+    pub fn takes_pose_messages(&self) -> bool {
+        let RawConfig { engine, odometry_source, .. } = &self.raw;
+        *engine == EngineKind::KnownPoses && *odometry_source == OdometrySource::Auto
+    }
+
     /// How the laser sits on the robot, where the configuration says so.
     #[must_use]
     pub fn laser_mount(&self) -> Option<LaserMount> {
@@ -177,6 +185,12 @@ impl Config {
             },
         })
     }
+}
+
+fn occupied_threshold(raw: &RawConfig) -> OccupiedThreshold {
+    let many = raw.engine == EngineKind::KnownPoses && raw.map_of == MapOf::AllScans;
+    let visits = raw.occupied_min_visits.unwrap_or(if many { 2 } else { 1 });
+    OccupiedThreshold { share: raw.occupied_threshold, visits }
 }
 
 fn matcher_parameters(raw: &RawConfig) -> MatcherParameters {

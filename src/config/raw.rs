@@ -141,6 +141,10 @@ pub struct RawConfig {
     /// A cell is occupied when hits / visits is above this.
     #[serde(rename = "occ_thresh")]
     pub occupied_threshold: f64,
+    /// A cell that fewer scans saw is not occupied but unknown; left out, 2 for `known_poses` and
+    /// all scans, else 1.
+    #[serde(rename = "occ_min_visits")]
+    pub occupied_min_visits: Option<u32>,
     /// Whether a beam without return marks free space out to `maxUrange`.
     pub free_on_no_return: bool,
 
@@ -297,7 +301,8 @@ impl Default for RawConfig {
             initial_pose: None,
             laser: None,
             resolution: core.resolution,
-            occupied_threshold: core.map.occupied_threshold,
+            occupied_threshold: core.map.occupied_threshold.share,
+            occupied_min_visits: None,
             free_on_no_return: core.map.free_on_no_return,
             map_resolution: hector.resolution,
             map_multi_res_levels: hector.levels,
@@ -363,6 +368,8 @@ pub struct Keys {
     pub scan: String,
     /// Odometry: `nav_msgs/Odometry`.
     pub odom: String,
+    /// Given poses, for `known_poses`: `geometry_msgs/PoseWithCovarianceStamped` or `PoseStamped`.
+    pub pose: String,
     /// Transforms that change: `tf2_msgs/TFMessage`.
     pub tf: String,
     /// Transforms that do not: `tf2_msgs/TFMessage`.
@@ -374,6 +381,7 @@ impl Default for Keys {
         Self {
             scan: "scan".to_owned(),
             odom: "odom".to_owned(),
+            pose: "amcl_pose".to_owned(),
             tf: "tf".to_owned(),
             tf_static: "tf_static".to_owned(),
         }

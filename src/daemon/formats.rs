@@ -15,7 +15,7 @@ use crate::evaluation::{self, StampedPose};
 use crate::map;
 use crate::map::region::{Layer, Region, RegionError, Window};
 use crate::ros;
-use crate::slam::grid::occupancy::{OccupancyGrid, OccupancyMap};
+use crate::slam::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use crate::slam::path::Path;
 use crate::slam::pose::{Point2, Pose2, Stamp};
 
@@ -199,9 +199,10 @@ impl MapProducts {
         Ok(self.cells_of(asked)?.json(layers, map, threshold).into())
     }
 
-    fn counted(&self) -> (Option<&OccupancyMap>, f64) {
+    fn counted(&self) -> (Option<&OccupancyMap>, OccupiedThreshold) {
         let version = self.version.as_ref();
-        version.map_or((None, 0.0), |map| (Some(&map.occupancy), map.occupied_threshold))
+        let nothing = (None, OccupiedThreshold::of_share(0.0));
+        version.map_or(nothing, |map| (Some(&map.occupancy), map.occupied_threshold))
     }
 
     fn cells_of(&self, asked: &RegionQuestion) -> Result<Region, FormatError> {
@@ -342,7 +343,7 @@ mod tests {
             epoch: 1,
             stamp: Stamp(2_500_000_000),
             occupancy,
-            occupied_threshold: 0.25,
+            occupied_threshold: OccupiedThreshold::of_share(0.25),
             path: path.into_iter().collect(),
         })
     }

@@ -12,10 +12,10 @@ use super::ledger::Verdict;
 use super::mailbox::{Mail, Mailbox};
 use super::synchronizer::{FramedScan, Refusal};
 use crate::clock;
-use crate::config::Keys;
+use crate::config::{Config, Keys};
 use crate::convert;
 use crate::ros;
-use crate::ros::graph::{LASER_SCAN, ODOMETRY, TF_MESSAGE, WireType};
+use crate::ros::graph::{LASER_SCAN, ODOMETRY, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, WireType};
 use crate::slam::pose::Stamp;
 use crate::tf::Kind;
 
@@ -38,6 +38,8 @@ pub enum Input {
     Scan,
     /// `nav_msgs/Odometry`.
     Odom,
+    /// `geometry_msgs/PoseWithCovarianceStamped` or `PoseStamped`: where the base is in the map.
+    Pose,
     /// `tf2_msgs/TFMessage`, of frames that move.
     Tf,
     /// `tf2_msgs/TFMessage`, of frames that do not.
@@ -45,8 +47,14 @@ pub enum Input {
 }
 
 impl Input {
-    /// All inputs.
-    pub const ALL: [Self; 4] = [Self::Scan, Self::Odom, Self::Tf, Self::TfStatic];
+    /// All inputs; a daemon listens to `Odom` or to `Pose`.
+    pub const ALL: [Self; 5] = [Self::Scan, Self::Odom, Self::Pose, Self::Tf, Self::TfStatic];
+
+    /// Where messages say how the base moves: given poses or odometry.
+    #[must_use]
+    pub fn of_motion(config: &Config) -> Self {
+        if config.takes_pose_messages() { Self::Pose } else { Self::Odom }
+    }
 
     /// Its name in the configuration and the status.
     #[must_use]
@@ -54,6 +62,7 @@ impl Input {
         match self {
             Self::Scan => "scan",
             Self::Odom => "odom",
+            Self::Pose => "pose",
             Self::Tf => "tf",
             Self::TfStatic => "tf_static",
         }
@@ -65,15 +74,18 @@ impl Input {
         match self {
             Self::Scan => LASER_SCAN,
             Self::Odom => ODOMETRY,
+            Self::Pose => POSE_WITH_COVARIANCE_STAMPED,
             Self::Tf | Self::TfStatic => TF_MESSAGE,
         }
     }
 
     /// Its key under the prefix.
-    pub(super) fn key_in(self, keys: &Keys) -> &str {
+    #[must_use]
+    pub fn key_in(self, keys: &Keys) -> &str {
         match self {
             Self::Scan => &keys.scan,
             Self::Odom => &keys.odom,
+            Self::Pose => &keys.pose,
             Self::Tf => &keys.tf,
             Self::TfStatic => &keys.tf_static,
         }
@@ -82,7 +94,7 @@ impl Input {
     const fn most_waiting(self) -> usize {
         match self {
             Self::Scan => MOST_SCANS,
-            Self::Odom | Self::Tf | Self::TfStatic => MOST_OTHERS,
+            Self::Odom | Self::Pose | Self::Tf | Self::TfStatic => MOST_OTHERS,
         }
     }
 }
@@ -299,7 +311,9 @@ impl Decoder<'_> {
         };
         match input {
             Input::Scan => self.refuse(None, Verdict::NotDecodable, reason),
-            Input::Odom | Input::Tf | Input::TfStatic => self.inbox.reject(input, reason),
+            Input::Odom | Input::Pose | Input::Tf | Input::TfStatic => {
+                self.inbox.reject(input, reason);
+            }
         }
     }
 
@@ -307,6 +321,7 @@ impl Decoder<'_> {
         match input {
             Input::Scan => self.scan(bytes),
             Input::Odom => self.odometry(bytes),
+            Input::Pose => self.pose(bytes),
             Input::Tf => self.transforms(bytes, Kind::Dynamic),
             Input::TfStatic => self.transforms(bytes, Kind::Static),
         }
@@ -338,6 +353,17 @@ impl Decoder<'_> {
         match sample {
             Ok(sample) => self.mailbox.put(Mail::Odometry(sample.stamp, sample.odom_from_base)),
             Err(reason) => self.inbox.reject(Input::Odom, reason),
+        }
+    }
+
+    fn pose(&self, bytes: &[u8]) {
+        let message = match ros::decode_pose(bytes, self.encoding) {
+            Ok(message) => message,
+            Err(error) => return self.inbox.reject(Input::Pose, error.to_string()),
+        };
+        match convert::stamped_pose(message) {
+            Ok(pose) => self.mailbox.put(Mail::Pose(pose)),
+            Err(error) => self.inbox.reject(Input::Pose, error.to_string()),
         }
     }
 

@@ -65,14 +65,23 @@ impl std::fmt::Display for Prefix {
 /// The keys that the daemon listens to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InputKeys {
-    keys: [OwnedKeyExpr; Input::ALL.len()],
+    /// Of the scans, of what tells motion, and of the transforms that move and that do not.
+    keys: [OwnedKeyExpr; 4],
+    motion: Input,
 }
 
 impl InputKeys {
-    /// The keys of [`Input::ALL`], in that order.
-    #[must_use]
-    pub const fn new(keys: [OwnedKeyExpr; Input::ALL.len()]) -> Self {
-        Self { keys }
+    /// The inputs with the keys that `key` gives them; `motion` is [`Input::Pose`], or odometry.
+    ///
+    /// # Errors
+    /// When `key` has none for one of them.
+    pub fn of_inputs(
+        motion: Input,
+        key: impl FnMut(Input) -> Result<OwnedKeyExpr, KeyError>,
+    ) -> Result<Self, KeyError> {
+        let [scan, moves, tf, tf_static] =
+            [Input::Scan, motion, Input::Tf, Input::TfStatic].map(key);
+        Ok(Self { keys: [scan?, moves?, tf?, tf_static?], motion })
     }
 
     /// The configured names under the prefix, as they are without ROS 2's own keys.
@@ -80,26 +89,36 @@ impl InputKeys {
     /// # Errors
     /// When one of them is not part of a key or has wildcards.
     pub fn under(prefix: &Prefix, names: &Keys) -> Result<Self, KeyError> {
-        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| prefix.key(input.key_in(names)));
-        Ok(Self::new([scan?, odom?, tf?, tf_static?]))
+        Self::of_inputs(Input::Odom, |input| prefix.key(input.key_in(names)))
     }
 
     /// Whole keys, as a daemon tells them; by ROS 2's own convention they end with a wildcard.
     ///
     /// # Errors
     /// When one of them is no key.
-    pub fn parse(keys: [String; Input::ALL.len()]) -> Result<Self, KeyError> {
-        let [scan, odom, tf, tf_static] = keys.map(key_expression);
-        Ok(Self::new([scan?, odom?, tf?, tf_static?]))
+    pub fn parse(motion: Input, mut key: impl FnMut(Input) -> String) -> Result<Self, KeyError> {
+        Self::of_inputs(motion, |input| key_expression(key(input)))
     }
 
-    /// The key of an input.
+    /// What is listened to.
+    #[must_use]
+    pub const fn inputs(&self) -> [Input; 4] {
+        [Input::Scan, self.motion, Input::Tf, Input::TfStatic]
+    }
+
+    /// Where messages say how the base moves: [`Input::Odom`] or [`Input::Pose`].
+    #[must_use]
+    pub const fn motion(&self) -> Input {
+        self.motion
+    }
+
+    /// The key of an input; odometry and given poses stand for each other.
     #[must_use]
     pub const fn of(&self, input: Input) -> &OwnedKeyExpr {
-        let [scan, odom, tf, tf_static] = &self.keys;
+        let [scan, motion, tf, tf_static] = &self.keys;
         match input {
             Input::Scan => scan,
-            Input::Odom => odom,
+            Input::Odom | Input::Pose => motion,
             Input::Tf => tf,
             Input::TfStatic => tf_static,
         }

@@ -9,6 +9,7 @@ use std::time::Instant;
 use super::command::Request;
 use super::ledger::Verdict;
 use super::synchronizer::{FramedScan, Refusal};
+use crate::convert::FramedPose;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::tf::{Kind, Transform};
 
@@ -26,6 +27,8 @@ const MOST_COMMANDS: usize = 64;
 pub enum Mail {
     /// From `odom`.
     Odometry(Stamp, Pose2),
+    /// From `pose`.
+    Pose(FramedPose),
     /// From `tf` or `tf_static`.
     Transform(Transform, Kind),
     /// From `scan`.

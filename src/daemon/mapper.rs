@@ -14,10 +14,11 @@ use super::ledger::{Entry, Ledger, Verdict};
 use super::mailbox::{Event, Mail, Mailbox};
 use super::snapshot::{Estimate, MapVersion, Snapshot};
 use super::synchronizer::{
-    self, Call, Channel, Need, ReadyScan, Refusal, ScanCounts, Synchronizer,
+    self, Call, Channel, Need, ReadyScan, Refusal, ScanCounts, Sought, Synchronizer,
 };
 use crate::clock::{self, Stopwatch};
-use crate::config::Config;
+use crate::config::{Config, EngineKind, OdometrySource};
+use crate::convert::FramedPose;
 use crate::slam::engine::{Engine, Sweep};
 use crate::slam::gmapping::ThreadsError;
 use crate::slam::odometry::JumpGuard;
@@ -91,6 +92,8 @@ pub struct Mapper {
     map_update_interval: f64,
     synchronizer: Synchronizer,
     frames: Frames,
+    /// What given poses are in.
+    map_frame: String,
     view: View,
     gauges: Gauges,
     /// Verdicts since the last snapshot.
@@ -189,6 +192,7 @@ impl Mapper {
             synchronizer: synchronizer(config, keys, need),
             engine,
             frames: frames(config, keys),
+            map_frame: config.raw.map_frame.clone(),
             view: View::new(),
             gauges: Gauges::default(),
             untold: Vec::new(),
@@ -240,6 +244,7 @@ impl Mapper {
             Mail::Odometry(stamp, odom_from_base) => {
                 self.take_odometry(Channel::Messages, stamp, odom_from_base);
             }
+            Mail::Pose(pose) => self.take_pose(pose),
             Mail::Transform(transform, kind) => self.take_transform(&transform, kind),
             Mail::Scan(framed) => self.synchronizer.scan(framed, clock::now(), &self.frames),
         }
@@ -257,6 +262,16 @@ impl Mapper {
             }
         }
         self.synchronizer.frames_changed(&self.frames);
+    }
+
+    /// A pose without a frame is one in the map: who has no ROS has no frames.
+    fn take_pose(&mut self, pose: FramedPose) {
+        let FramedPose { stamp, frame, frame_from_base } = pose;
+        if !frame.is_empty() && frame.trim_start_matches('/') != self.map_frame {
+            let reason = format!("it is a pose in `{frame}`, and not in `{}`", self.map_frame);
+            return self.connections.inbox.reject(Input::Pose, reason);
+        }
+        self.take_odometry(Channel::Messages, stamp, frame_from_base);
     }
 
     fn take_odometry(&mut self, channel: Channel, stamp: Stamp, odom_from_base: Pose2) {
@@ -501,13 +516,19 @@ impl Mapper {
 
 fn synchronizer(config: &Config, keys: &InputKeys, need: Need) -> Synchronizer {
     let raw = &config.raw;
+    let (source, sought) = match keys.motion() {
+        Input::Pose => (OdometrySource::Auto, Sought::Pose),
+        _ if raw.engine == EngineKind::KnownPoses => (raw.odometry_source, Sought::Pose),
+        _ => (raw.odometry_source, Sought::Odometry),
+    };
     Synchronizer::new(synchronizer::Settings {
         odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
         most_waiting: raw.scan_queue,
         sweep_time_s: raw.sweep_time_s,
-        source: raw.odometry_source,
+        source,
+        sought,
         need,
-        odom_key: keys.of(Input::Odom).to_string(),
+        odom_key: keys.of(keys.motion()).to_string(),
         tf_path: format!(
             "{} (from `{}` to `{}`)",
             keys.of(Input::Tf),

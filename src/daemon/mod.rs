@@ -159,7 +159,8 @@ async fn record(
     let raw = &settings.config.raw;
     let Some(path) = &raw.record else { return Ok(None) };
     let (id, prefix) = (session.zid().to_string(), settings.prefix.clone());
-    let keys = RosNode::new(id, prefix, Convention::new(raw)).inputs(&raw.keys)?;
+    let keys = RosNode::new(id, prefix, Convention::new(raw))
+        .inputs(&raw.keys, Input::of_motion(&settings.config))?;
     let recorder = Recorder::start(session, &settings.prefix, &keys, path.as_ref()).await?;
     tracing::info!("recording to {}", recorder.unfinished().display());
     Ok(Some(recorder))
@@ -220,7 +221,7 @@ impl Daemon {
         let Settings { config, prefix, threads } = settings;
         let convention = Convention::new(&config.raw);
         let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
-        let keys = node.inputs(&config.raw.keys)?;
+        let keys = node.inputs(&config.raw.keys, Input::of_motion(&config))?;
         let mut daemon = Self::deaf(&config, &keys, threads)?;
         let sources = Sources {
             snapshots: daemon.snapshots(),
@@ -403,9 +404,11 @@ async fn subscribe(
         move |error| DaemonError::Subscribe { key, reason: plain_message(&error) }
     };
     let mut changing = Vec::new();
-    for input in [Input::Tf, Input::Odom, Input::Scan] {
-        // Our own transforms leave on the key on which others come in.
-        let origin = if input == Input::Tf { Locality::Remote } else { Locality::Any };
+    for input in [Input::Tf, keys.motion(), Input::Scan] {
+        // Our own transforms leave on the key on which others come in, and our pose is none of
+        // those that are given.
+        let own = matches!(input, Input::Tf | Input::Pose);
+        let origin = if own { Locality::Remote } else { Locality::Any };
         let inbox = Arc::clone(inbox);
         let subscriber = session
             .declare_subscriber(keys.of(input))
@@ -432,9 +435,10 @@ fn asked(status: &Arc<StatusSource>) -> serving::AskStatus {
 
 fn tell_keys(keys: &InputKeys) {
     tracing::info!(
-        "waiting for scans on {}, odometry on {} or {}, static transforms on {}",
+        "waiting for scans on {}, {} on {} or {}, static transforms on {}",
         keys.of(Input::Scan),
-        keys.of(Input::Odom),
+        if keys.motion() == Input::Pose { "poses" } else { "odometry" },
+        keys.of(keys.motion()),
         keys.of(Input::Tf),
         keys.of(Input::TfStatic)
     );

@@ -122,7 +122,7 @@ impl Recorder {
         let ended = spawn(file, items, Arc::clone(&lost))?;
         let taps = Taps { session, sender: &sender, lost: &lost };
         let mut inputs = Vec::new();
-        for input in [Input::Tf, Input::Odom, Input::Scan] {
+        for input in [Input::Tf, keys.motion(), Input::Scan] {
             inputs.push(taps.plain(keys.of(input), input.wire_type().name).await?);
         }
         let tf_static = Some(taps.with_history(keys.of(Input::TfStatic)).await?);

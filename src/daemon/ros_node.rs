@@ -92,9 +92,8 @@ impl RosNode {
     ///
     /// # Errors
     /// When a name is not part of a key, or of a ROS name where ROS 2 nodes are to know it.
-    pub fn inputs(&mut self, names: &Keys) -> Result<InputKeys, KeyError> {
-        let [scan, odom, tf, tf_static] = Input::ALL.map(|input| self.input(input, names));
-        Ok(InputKeys::new([scan?, odom?, tf?, tf_static?]))
+    pub fn inputs(&mut self, names: &Keys, motion: Input) -> Result<InputKeys, KeyError> {
+        InputKeys::of_inputs(motion, |input| self.input(input, names))
     }
 
     fn input(&mut self, input: Input, names: &Keys) -> Result<OwnedKeyExpr, KeyError> {
@@ -210,7 +209,7 @@ impl Input {
             // A bridge reads a topic as the first that it hears of wants it, and who wants
             // reliability would never hear a driver that does not offer it.
             Self::Scan => Qos::best_effort(5),
-            Self::Odom => Qos::best_effort(50),
+            Self::Odom | Self::Pose => Qos::best_effort(50),
             Self::Tf => Qos::best_effort(100),
             Self::TfStatic => Qos::latched(100),
         }
@@ -238,8 +237,8 @@ mod tests {
     }
 
     fn listened(node: &mut RosNode, names: &Keys) -> [String; 4] {
-        let keys = node.inputs(names).unwrap();
-        Input::ALL.map(|input| keys.of(input).to_string())
+        let keys = node.inputs(names, Input::Odom).unwrap();
+        keys.inputs().map(|input| keys.of(input).to_string())
     }
 
     #[test]
@@ -252,16 +251,30 @@ mod tests {
         assert_eq!(scan, "3/robot01/front/scan/sensor_msgs::msg::dds_::LaserScan_/*");
         assert_eq!(tf_static, "3/robot01/tf_static/tf2_msgs::msg::dds_::TFMessage_/*");
         let names = Keys { odom: "*".to_owned(), ..Keys::default() };
-        let error = node("", Convention::Bridge).inputs(&names).unwrap_err();
+        let error = node("", Convention::Bridge).inputs(&names, Input::Odom).unwrap_err();
         assert_eq!(error, KeyError::Wildcard("*".to_owned()));
+    }
+
+    #[test]
+    fn given_poses_are_listened_to_in_place_of_odometry() {
+        let mut node = node("robot01", HUMBLE);
+        let keys = node.inputs(&Keys::default(), Input::Pose).unwrap();
+        assert_eq!(keys.inputs()[1], Input::Pose);
+        assert_eq!(
+            keys.of(Input::Pose).as_str(),
+            "3/robot01/amcl_pose/geometry_msgs::msg::dds_::PoseWithCovarianceStamped_/*"
+        );
+        let tokens = node.tokens();
+        assert!(tokens.iter().any(|token| token.contains("amcl_pose")), "{tokens:?}");
+        assert!(!tokens.iter().any(|token| token.contains("odom")), "{tokens:?}");
     }
 
     #[test]
     fn a_name_that_ros_does_not_have_is_an_error_where_ros_nodes_read_it() {
         let names = Keys::default();
-        assert!(node("robot-01", Convention::Bridge).inputs(&names).is_ok());
+        assert!(node("robot-01", Convention::Bridge).inputs(&names, Input::Odom).is_ok());
         for prefix in ["robot-01", "1", "robot01/2nd"] {
-            let error = node(prefix, HUMBLE).inputs(&names).unwrap_err();
+            let error = node(prefix, HUMBLE).inputs(&names, Input::Odom).unwrap_err();
             assert_eq!(error, KeyError::NotRosName(format!("{prefix}/scan")));
         }
     }

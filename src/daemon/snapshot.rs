@@ -6,7 +6,7 @@ use nalgebra::Matrix3;
 use serde::Serialize;
 
 use super::ledger::Ledger;
-use crate::slam::grid::occupancy::OccupancyMap;
+use crate::slam::grid::occupancy::{OccupancyMap, OccupiedThreshold};
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::update::ScanReport;
@@ -59,8 +59,8 @@ pub struct MapVersion {
     pub stamp: Stamp,
     /// Hits and visits of each cell.
     pub occupancy: OccupancyMap,
-    /// A cell is occupied when its hits / visits is above this.
-    pub occupied_threshold: f64,
+    /// When a cell is occupied.
+    pub occupied_threshold: OccupiedThreshold,
     /// The pose of the base at each processed scan.
     pub path: Path,
 }

@@ -200,13 +200,13 @@ impl StatusSource {
 
     fn inputs(&self, gauges: &Gauges) -> BTreeMap<&'static str, InputStatus> {
         let status = |input| (Input::name(input), self.input(input, gauges));
-        Input::ALL.into_iter().map(status).collect()
+        self.keys.inputs().into_iter().map(status).collect()
     }
 
     fn input(&self, input: Input, gauges: &Gauges) -> InputStatus {
         let tally = self.inbox.tally(input);
         let now = clock::now();
-        let lost = if input == Input::Odom { self.mailbox.lost_motions() } else { 0 };
+        let lost = if input == self.keys.motion() { self.mailbox.lost_motions() } else { 0 };
         let status = InputStatus {
             key: self.keys.of(input).to_string(),
             received: tally.received,
@@ -223,11 +223,11 @@ impl StatusSource {
                 clock_restarts: gauges.scans.clock_restarts,
                 ..status
             },
-            Input::Odom if gauges.channel == Some(Channel::Messages) => {
+            Input::Odom | Input::Pose if gauges.channel == Some(Channel::Messages) => {
                 with_counts(status, gauges.odometry)
             }
             Input::Tf => with_counts(status, gauges.transforms.samples),
-            Input::Odom | Input::TfStatic => status,
+            Input::Odom | Input::Pose | Input::TfStatic => status,
         }
     }
 

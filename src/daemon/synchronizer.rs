@@ -45,6 +45,8 @@ pub struct Settings {
     pub most_waiting: usize,
     /// Where odometry comes from.
     pub source: OdometrySource,
+    /// What comes from there.
+    pub sought: Sought,
     /// Seconds from the first beam of a sweep to the last; `None` is as the scan says, and 0 takes
     /// all at once.
     pub sweep_time_s: Option<f64>,
@@ -54,6 +56,31 @@ pub struct Settings {
     pub odom_key: String,
     /// Which transforms tell odometry, in words: key and frames.
     pub tf_path: String,
+}
+
+/// What says where the base is when a scan is taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sought {
+    /// Odometry.
+    Odometry,
+    /// A given pose.
+    Pose,
+}
+
+impl Sought {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Odometry => "odometry",
+            Self::Pose => "a given pose",
+        }
+    }
+
+    const fn none(self) -> &'static str {
+        match self {
+            Self::Odometry => "no odometry",
+            Self::Pose => "no given pose",
+        }
+    }
 }
 
 /// What becomes of a scan whose odometry does not come.
@@ -516,22 +543,23 @@ impl Synchronizer {
                 Chance::MayCome,
             )),
             (Err(Missing::Empty), _) => {
-                let detail = format!("no odometry has come {}", self.origin());
+                let detail = format!("{} has come {}", self.settings.sought.none(), self.origin());
                 Err(Lack { verdict: Verdict::NoOdometry, detail, chance: Chance::MayCome })
             }
         }
     }
 
     fn lack(&self, missing_s: f64, what: &str, chance: Chance) -> Lack {
+        let sought = self.settings.sought.name();
         let remedy = if missing_s > CLOCKS_DIFFER_S {
-            "do the clocks that stamp them agree, and does odometry still come?"
+            format!("do the clocks that stamp them agree, and does {sought} still come?")
         } else {
-            "if odometry only comes late or seldom, raise odometry_timeout_s"
+            format!("if {sought} only comes late or seldom, raise odometry_timeout_s")
         };
         let origin = self.origin();
         let milliseconds = missing_s * 1e3;
         let detail = format!(
-            "odometry is missing by {milliseconds:.1} ms: {what} by that, of those {origin}; {remedy}"
+            "{sought} is missing by {milliseconds:.1} ms: {what} by that, of those {origin}; {remedy}"
         );
         Lack { verdict: Verdict::NoOdometry, detail, chance }
     }

@@ -114,9 +114,8 @@ impl TileSet {
 
     fn touched(&self, map: &MapVersion) -> BTreeSet<TileIndex> {
         let counts = map.occupancy.counts();
-        let same_rule = |before: &&Arc<MapVersion>| {
-            before.occupied_threshold.total_cmp(&map.occupied_threshold).is_eq()
-        };
+        let same_rule =
+            |before: &&Arc<MapVersion>| before.occupied_threshold == map.occupied_threshold;
         match self.map.as_ref().filter(same_rule) {
             Some(before) => {
                 let written = counts.tiles_not_shared_with(before.occupancy.counts());

@@ -5,7 +5,7 @@ use thiserror::Error;
 
 use super::tiles::Extent;
 use crate::slam::grid::Cell;
-use crate::slam::grid::occupancy::{Count, OccupancyGrid, OccupancyMap};
+use crate::slam::grid::occupancy::{Count, OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use crate::slam::grid::tile_map::{TILE_SIZE, TileKey};
 use crate::slam::pose::Point2;
 
@@ -118,8 +118,12 @@ impl Region {
     /// Occupied where a cell of the map is, free where one is and none is occupied, unknown where
     /// nothing is known.
     #[must_use]
-    pub fn occupancy(&self, map: Option<&OccupancyMap>, occupied_threshold: f64) -> OccupancyGrid {
-        let cells = self.maxima(map, -1, |count| count.occupancy(occupied_threshold));
+    pub fn occupancy(
+        &self,
+        map: Option<&OccupancyMap>,
+        threshold: OccupiedThreshold,
+    ) -> OccupancyGrid {
+        let cells = self.maxima(map, -1, |count| count.occupancy(threshold));
         let corner = |i: i32| f64::from(i) * self.resolution;
         OccupancyGrid {
             resolution: self.resolution,
@@ -130,7 +134,12 @@ impl Region {
         }
     }
 
-    fn layer(&self, layer: Layer, map: Option<&OccupancyMap>, threshold: f64) -> Vec<i64> {
+    fn layer(
+        &self,
+        layer: Layer,
+        map: Option<&OccupancyMap>,
+        threshold: OccupiedThreshold,
+    ) -> Vec<i64> {
         match layer {
             Layer::Occupancy => self.maxima(map, -1, |count| count.occupancy(threshold).into()),
             Layer::Hits => self.maxima(map, 0, |count| count.hits.into()),
@@ -141,7 +150,12 @@ impl Region {
     /// Layers as JSON: size and place as in the JSON of a map, and in `layers` the runs of each,
     /// the largest value of the merged cells in each.
     #[must_use]
-    pub fn json(&self, layers: &[Layer], map: Option<&OccupancyMap>, threshold: f64) -> String {
+    pub fn json(
+        &self,
+        layers: &[Layer],
+        map: Option<&OccupancyMap>,
+        threshold: OccupiedThreshold,
+    ) -> String {
         let corner = |i: i32| f64::from(i) * self.resolution;
         let runs = layers.iter().map(|&layer| {
             let cells = self.layer(layer, map, threshold);
@@ -211,6 +225,8 @@ mod tests {
     use proptest::prelude::{prop_assert_eq, proptest};
 
     use super::*;
+
+    const THRESHOLD: OccupiedThreshold = OccupiedThreshold::of_share(0.25);
     use crate::slam::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
     use crate::slam::pose::Pose2;
 
@@ -238,7 +254,7 @@ mod tests {
         ) {
             let (map, window) = (map(), window([x, y], [x + size, y + size]));
             let region = Region::new(window, res, FINE).unwrap();
-            let coarse = region.occupancy(Some(&map), 0.25);
+            let coarse = region.occupancy(Some(&map), THRESHOLD);
             let factor = (coarse.resolution / FINE).round() as i32;
             assert!(coarse.resolution >= res - 1e-6 && coarse.resolution < res + FINE + 1e-6);
             assert!(coarse.origin.x <= x + 1e-6 && coarse.origin.y <= y + 1e-6);
@@ -249,7 +265,7 @@ mod tests {
                 let iy = region.extent.iy + (i / coarse.width) as i32;
                 let covered = (0..factor * factor).map(|k| {
                     let cell = Cell::new(ix * factor + k % factor, iy * factor + k / factor);
-                    map.counts().get(cell).occupancy(0.25)
+                    map.counts().get(cell).occupancy(THRESHOLD)
                 });
                 prop_assert_eq!(cell, covered.max().unwrap());
             }
@@ -259,7 +275,7 @@ mod tests {
     #[test]
     fn walls_stay_and_the_unknown_stays_unknown() {
         let region = Region::new(window([-4.0, -2.0], [4.0, 2.0]), 0.8, FINE).unwrap();
-        let grid = region.occupancy(Some(&map()), 0.25);
+        let grid = region.occupancy(Some(&map()), THRESHOLD);
         assert_eq!((grid.width, grid.height), (10, 6));
         let row = &grid.cells[30..40];
         assert_eq!(row, [-1, -1, -1, -1, -1, 0, 0, 100, -1, -1]);
@@ -276,14 +292,14 @@ mod tests {
             map.add(&outline, Pose2::IDENTITY);
         }
         let region = Region::new(window([2.0, 0.0], [2.2, 0.2]), 0.2, FINE).unwrap();
-        let text = region.json(&[Layer::Hits, Layer::Visits], Some(&map), 0.25);
+        let text = region.json(&[Layer::Hits, Layer::Visits], Some(&map), THRESHOLD);
         assert_eq!(
             text,
             r#"{"resolution":0.2,"width":1,"height":1,"origin":[2.0,0.0],"layers":{"hits":[[3,1]],"visits":[[3,1]]}}"#
         );
-        let text = region.json(&[Layer::Hits], Some(&clone), 0.25);
+        let text = region.json(&[Layer::Hits], Some(&clone), THRESHOLD);
         assert!(text.ends_with(r#""layers":{"hits":[[1,1]]}}"#), "{text}");
-        let text = region.json(&[Layer::Occupancy, Layer::Hits], None, 0.25);
+        let text = region.json(&[Layer::Occupancy, Layer::Hits], None, THRESHOLD);
         assert!(text.ends_with(r#""layers":{"hits":[[0,1]],"occupancy":[[-1,1]]}}"#), "{text}");
     }
 
@@ -296,6 +312,6 @@ mod tests {
         let error = Region::new(large, 0.1, FINE).unwrap_err().to_string();
         assert!(error.starts_with("the region has 20000000 by 20000000 cells of 0.1 m"), "{error}");
         let coarse = Region::new(large, 1e4, FINE).unwrap();
-        assert_eq!(coarse.occupancy(Some(&map()), 0.25).cells.iter().max(), Some(&100));
+        assert_eq!(coarse.occupancy(Some(&map()), THRESHOLD).cells.iter().max(), Some(&100));
     }
 }

@@ -4,8 +4,8 @@ use byteorder::{BigEndian, ByteOrder, LittleEndian};
 use cdr_encoding::CdrDeserializer;
 use thiserror::Error;
 
-use super::Message;
 use super::field_path::FieldPath;
+use super::{Message, PoseStamped, PoseWithCovarianceStamped};
 
 /// Length of the header that says how a CDR body is written; offsets count from its start.
 const CDR_HEADER: usize = 4;
@@ -93,6 +93,20 @@ pub fn decode<M: Message>(bytes: &[u8], encoding: &str) -> Result<M, DecodeError
             length: bytes.len(),
             start: bytes.iter().copied().take(CDR_HEADER).collect(),
         }),
+    }
+}
+
+/// Reads a pose, which may be a `PoseWithCovarianceStamped` or a `PoseStamped`: neither reads as
+/// the other.
+///
+/// # Errors
+/// When the bytes are neither; the error is that of the pose with a covariance.
+pub fn decode_pose(bytes: &[u8], encoding: &str) -> Result<PoseStamped, DecodeError> {
+    match decode::<PoseWithCovarianceStamped>(bytes, encoding) {
+        Ok(PoseWithCovarianceStamped { header, pose }) => {
+            Ok(PoseStamped { header, pose: pose.pose })
+        }
+        Err(error) => decode(bytes, encoding).or(Err(error)),
     }
 }
 

@@ -19,7 +19,7 @@ mod std_msgs;
 mod tests;
 mod tf2_msgs;
 
-pub use decode::{DecodeError, decode};
+pub use decode::{DecodeError, decode, decode_pose};
 pub use diagnostic_msgs::{DiagnosticArray, DiagnosticStatus, KeyValue};
 pub use encode::{cdr, json};
 pub use fields::{Covariance, Int8Array};

@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 
 use super::gmapping::{GMapping, Parameters, ThreadsError};
-use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
+use super::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::TileCounts;
 use super::hector::{self, Hector};
 use super::known_poses::{self, KnownPoses};
@@ -192,9 +192,9 @@ impl Engine {
         }
     }
 
-    /// A cell is occupied when its hits / visits is above this.
+    /// When a cell is occupied.
     #[must_use]
-    pub fn occupied_threshold(&self) -> f64 {
+    pub fn occupied_threshold(&self) -> OccupiedThreshold {
         match self {
             Self::GMapping(filter) => filter.occupied_threshold(),
             Self::Hector(_) => hector::OCCUPIED_THRESHOLD,

@@ -6,7 +6,7 @@
 //! coarse grids empty, and takes nothing of a beam that ends outside of the map; here the grid
 //! grows, and beams are as long as they are.
 
-use super::grid::occupancy::{BeamEndKind, OccupancyMap};
+use super::grid::occupancy::{BeamEndKind, OccupancyMap, OccupiedThreshold};
 use super::odometry::{JumpGuard, JumpPolicy};
 use super::outline::{BeamLimits, outline};
 use super::path::Path;
@@ -30,8 +30,8 @@ pub struct Parameters {
     pub limits: BeamLimits,
     /// What the map is of.
     pub extent: MapExtent,
-    /// `occ_thresh`: a cell is occupied when its hits / visits is above this.
-    pub occupied_threshold: f64,
+    /// `occ_thresh` and `occ_min_visits`: when a cell is occupied.
+    pub occupied_threshold: OccupiedThreshold,
 }
 
 /// What the map is of.
@@ -124,9 +124,9 @@ impl KnownPoses {
         &self.map
     }
 
-    /// A cell is occupied when its hits / visits is above this.
+    /// When a cell is occupied.
     #[must_use]
-    pub const fn occupied_threshold(&self) -> f64 {
+    pub const fn occupied_threshold(&self) -> OccupiedThreshold {
         self.parameters.occupied_threshold
     }
 }

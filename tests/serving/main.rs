@@ -8,7 +8,7 @@ use gmapd::daemon::ledger::{Entry, Verdict};
 use gmapd::daemon::snapshot::{MapVersion, Snapshot};
 use gmapd::map;
 use gmapd::ros;
-use gmapd::slam::grid::occupancy::OccupancyGrid;
+use gmapd::slam::grid::occupancy::{OccupancyGrid, OccupiedThreshold};
 use gmapd::slam::pose::{Pose2, Stamp};
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use zenoh::bytes::ZBytes;
@@ -36,7 +36,10 @@ fn version(snapshot: &Snapshot) -> &MapVersion {
 }
 
 fn grid(snapshot: &Snapshot) -> OccupancyGrid {
-    version(snapshot).occupancy.to_grid(0.25).expect("the robot saw something")
+    version(snapshot)
+        .occupancy
+        .to_grid(OccupiedThreshold::of_share(0.25))
+        .expect("the robot saw something")
 }
 
 fn stamp(time: ros::Time) -> Stamp {

@@ -14,6 +14,7 @@ use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
 use gmapd::daemon::status::{FilterStatus, Status};
 use gmapd::ros;
 use gmapd::slam::gmapping::{GMapping, ScanReport, ScanUpdate};
+use gmapd::slam::grid::occupancy::OccupiedThreshold;
 use gmapd::slam::pose::{Point2, Pose2};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::{broadcast, mpsc, watch};
@@ -59,7 +60,7 @@ pub(crate) fn drive() -> Vec<Snapshot> {
                 epoch: 1,
                 stamp: shot.scan.stamp,
                 occupancy: filter.occupancy().clone(),
-                occupied_threshold: 0.25,
+                occupied_threshold: OccupiedThreshold::of_share(0.25),
                 path: filter.path(),
             };
             snapshots.push(snapshot(&filter, report, version));

@@ -15,6 +15,7 @@ fn settings() -> Settings {
         most_waiting: 4,
         sweep_time_s: None,
         source: OdometrySource::Auto,
+        sought: Sought::Odometry,
         need: Need::Required,
         odom_key: "robot01/odom".to_owned(),
         tf_path: "robot01/tf (from `odom` to `base_link`)".to_owned(),

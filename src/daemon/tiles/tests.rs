@@ -3,7 +3,7 @@ use proptest::prelude::{any, prop_assert, prop_assert_eq, proptest};
 use super::*;
 use crate::map::mirror::Mirror;
 use crate::slam::grid::occupancy::{
-    BeamEnd, BeamEndKind, OccupancyGrid, OccupancyMap, ScanOutline,
+    BeamEnd, BeamEndKind, OccupancyGrid, OccupancyMap, OccupiedThreshold, ScanOutline,
 };
 use crate::slam::path::Path;
 use crate::slam::pose::{Point2, Pose2, Stamp};
@@ -24,7 +24,7 @@ fn version(number: u64, occupancy: &OccupancyMap) -> Arc<MapVersion> {
         epoch: 1,
         stamp: Stamp(number as i64),
         occupancy: occupancy.clone(),
-        occupied_threshold: 0.25,
+        occupied_threshold: OccupiedThreshold::of_share(0.25),
         path: Path::default(),
     })
 }

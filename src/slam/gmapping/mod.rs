@@ -32,7 +32,7 @@ use self::random::{Purpose, Streams};
 pub use self::resampling::{WeightSmoothing, Weighting};
 pub use self::scan_matcher::{MatcherKind, MatcherParameters};
 use self::trajectory::{NodeId, TrajectoryTree};
-use super::grid::occupancy::{OccupancyGrid, OccupancyMap};
+use super::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::TileCounts;
 use super::odometry::Motion;
 pub use super::odometry::{JumpGuard, JumpPolicy};
@@ -422,9 +422,9 @@ impl GMapping {
         self.output.map()
     }
 
-    /// A cell is occupied when its hits / visits is above this.
+    /// When a cell is occupied.
     #[must_use]
-    pub const fn occupied_threshold(&self) -> f64 {
+    pub const fn occupied_threshold(&self) -> OccupiedThreshold {
         self.parameters.map.occupied_threshold
     }
 

@@ -1,5 +1,6 @@
 //! Everything the filter can be told; what belongs to one part of it is described there.
 
+use super::super::grid::occupancy::OccupiedThreshold;
 use super::super::motion_gate::MotionGate;
 use super::super::odometry::{JumpGuard, MotionNoise};
 use super::super::pose::Pose2;
@@ -57,14 +58,14 @@ impl Default for Parameters {
 /// The occupancy map that is handed out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MapParameters {
-    /// `occ_thresh`: a cell is occupied when hits / visits is above this.
-    pub occupied_threshold: f64,
+    /// `occ_thresh` and `occ_min_visits`: when a cell is occupied.
+    pub occupied_threshold: OccupiedThreshold,
     /// Whether a beam without return marks free space out to `maxUrange`.
     pub free_on_no_return: bool,
 }
 
 impl Default for MapParameters {
     fn default() -> Self {
-        Self { occupied_threshold: 0.25, free_on_no_return: false }
+        Self { occupied_threshold: OccupiedThreshold::of_share(0.25), free_on_no_return: false }
     }
 }

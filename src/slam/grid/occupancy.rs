@@ -22,6 +22,24 @@ pub struct Count {
     pub visits: u32,
 }
 
+/// When a cell is occupied.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OccupiedThreshold {
+    /// Its hits / visits is above this.
+    pub share: f64,
+    /// A cell whose share says so after fewer visits stays unknown: it may have been one wild
+    /// range. Karto decides after its `MinPassThrough` of 2, for free cells too.
+    pub visits: u32,
+}
+
+impl OccupiedThreshold {
+    /// The share alone decides.
+    #[must_use]
+    pub const fn of_share(share: f64) -> Self {
+        Self { share, visits: 1 }
+    }
+}
+
 /// Where a beam ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BeamEnd {
@@ -170,9 +188,9 @@ impl OccupancyMap {
 
     /// The map as it is handed out, cropped to the cells that were seen; `None` if there are none.
     ///
-    /// A cell is occupied if its share of hits is above `occupied_threshold`.
+    /// [`Count::occupancy`] says what a cell is.
     #[must_use]
-    pub fn to_grid(&self, occupied_threshold: f64) -> Option<OccupancyGrid> {
+    pub fn to_grid(&self, occupied_threshold: OccupiedThreshold) -> Option<OccupancyGrid> {
         let (low, high) = self.bounds()?;
         let (width, height) = ((high.ix - low.ix + 1) as usize, (high.iy - low.iy + 1) as usize);
         let mut cells = vec![-1; width * height];
@@ -225,15 +243,18 @@ impl OccupancyMap {
 }
 
 impl Count {
-    /// -1 for a cell nobody looked at, 100 if its share of hits is above the threshold, else 0.
+    /// -1 for a cell nobody looked at, or that too few scans call occupied; 100 if its share of
+    /// hits is above the threshold, else 0.
     #[must_use]
-    pub fn occupancy(self, occupied_threshold: f64) -> i8 {
+    pub fn occupancy(self, threshold: OccupiedThreshold) -> i8 {
         if self.visits == 0 {
             -1
-        } else if f64::from(self.hits) > occupied_threshold * f64::from(self.visits) {
-            100
-        } else {
+        } else if f64::from(self.hits) <= threshold.share * f64::from(self.visits) {
             0
+        } else if self.visits < threshold.visits {
+            -1
+        } else {
+            100
         }
     }
 }

@@ -22,7 +22,7 @@ use self::prediction::Prediction;
 use self::prepared_scan::{Directions, PreparedScan};
 use self::pyramid::Pyramid;
 use super::engine::Sweep;
-use super::grid::occupancy::{Count, OccupancyMap};
+use super::grid::occupancy::{Count, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::{TileCounts, TileKey};
 use super::odometry::Motion;
 use super::path::Path;
@@ -273,8 +273,8 @@ impl Hector {
     }
 }
 
-/// A cell of [`Hector::occupancy`] is occupied when its hits / visits is above this.
-pub const OCCUPIED_THRESHOLD: f64 = 0.5;
+/// When a cell of [`Hector::occupancy`] is occupied.
+pub const OCCUPIED_THRESHOLD: OccupiedThreshold = OccupiedThreshold::of_share(0.5);
 
 impl Odometry {
     /// Takes note of where the base is in `map` as odometry stands.
