@@ -67,7 +67,7 @@ pub(crate) struct Arguments {
     /// Seconds that the robot drives, by its own clock; the whole tour without
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..))]
     seconds: Option<u32>,
-    /// Show it in a browser, on a port of this machine that is printed
+    /// Show it in a browser too: prints the address, which is there until Ctrl-C
     #[arg(long)]
     view: bool,
 }
@@ -117,11 +117,19 @@ impl Drive {
         println!("meanwhile: gmapd get -e {endpoint} {robot} map");
         let mut page = JoinSet::new();
         if arguments.view {
-            let address = ([127, 0, 0, 1], 0).into();
-            page.spawn(view::serve(address, robot_session.clone()).await?);
+            let opened = view::Page::open(([127, 0, 0, 1], 0).into(), robot_session.clone());
+            let opened = opened.await?;
+            println!("look at it: {}", opened.address);
+            page.spawn(opened.serve());
         }
         tokio::select! {
-            driven = self.drive(&robot_session, prefix, &daemon) => driven?,
+            driven = self.drive(&robot_session, prefix, &daemon) => {
+                driven?;
+                if arguments.view {
+                    println!("the drive is over; the page is there until Ctrl-C");
+                    tokio::signal::ctrl_c().await.context("no signals come")?;
+                }
+            }
             signal = tokio::signal::ctrl_c() => signal.context("no signals come")?,
         }
         let last = daemon.stop().await;

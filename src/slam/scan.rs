@@ -210,7 +210,7 @@ pub enum MountOrientation {
 }
 
 /// How a laser sits on the robot.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct LaserMount {
     /// The laser's position and the direction of its x axis, in the base frame.
     pub base_from_laser: Pose2,

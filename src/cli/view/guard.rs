@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{self, Read as _};
 use std::net::IpAddr;
 
+use axum::http::uri::Authority;
 use axum::http::{HeaderMap, Method, header};
 use thiserror::Error;
 
@@ -74,7 +75,8 @@ impl Guard {
 }
 
 fn is_own(host: &str) -> bool {
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    let Ok(authority) = host.parse::<Authority>() else { return false };
+    let name = authority.host();
     let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
     name == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
@@ -114,6 +116,10 @@ mod tests {
         assert_eq!(check(&guard, &Method::GET, &[HOST]), Ok(()));
         assert_eq!(check(&guard, &Method::GET, &[("host", "localhost:1")]), Ok(()));
         assert_eq!(check(&guard, &Method::GET, &[("host", "[::1]:1")]), Ok(()));
+        assert_eq!(check(&guard, &Method::GET, &[("host", "[::1]")]), Ok(()));
+        assert_eq!(check(&guard, &Method::GET, &[("host", "127.0.0.1")]), Ok(()));
+        let look_alike = [("host", "127.0.0.1.evil.org")];
+        assert_eq!(check(&guard, &Method::GET, &look_alike), Err(Refusal::Host));
         assert_eq!(check(&guard, &Method::GET, &[("host", "evil.org:1")]), Err(Refusal::Host));
         assert_eq!(check(&guard, &Method::GET, &[]), Err(Refusal::Host));
     }

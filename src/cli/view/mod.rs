@@ -1,9 +1,11 @@
 //! `gmapd view`: robots and their maps in a browser.
 
+mod fleet;
 mod guard;
 mod page;
+mod robot;
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -19,6 +21,7 @@ use serde::Deserialize;
 use tokio::net::TcpListener;
 use zenoh::Session;
 
+use self::fleet::Fleet;
 use self::guard::Guard;
 use super::mesh;
 use super::session::SessionArguments;
@@ -26,11 +29,16 @@ use super::session::SessionArguments;
 /// Where the mesh is, and where the page is to be.
 #[derive(Debug, Args)]
 #[command(after_help = "\
-    Open the address that is printed. On other addresses than this machine's own, anybody who\n\
-    reaches it has to know the token that is printed with it.\n\n\
+    Open the address that is printed: it shows the robots that are alive, and of one of them the\n\
+    map as it grows, pose, scan, path and particles, and why the map does not grow. Set the pose,\n\
+    pause, reset and save there, measure distances, and download the map.\n\n\
+    Only this machine gets in, unless --listen says otherwise. Then anybody who reaches the\n\
+    address has to know the token in it, which is new at each start; there is no encryption, so\n\
+    in a network that is not yours, take ssh -L 8080:127.0.0.1:8080 instead.\n\n\
     Examples:\n  \
         gmapd view\n  \
-        gmapd view -e tcp/192.168.1.5:7447 --listen 0.0.0.0:8080\n\n\
+        gmapd view -e tcp/192.168.1.5:7447\n  \
+        gmapd view --listen 0.0.0.0:8080      for a phone: open the address that is printed\n\n\
     Exit codes: 0 ended by Ctrl-C, 1 failed, 2 wrong usage.")]
 pub(crate) struct Arguments {
     /// Address and port of the page; port 0 is any that is free
@@ -49,9 +57,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mesh::block_on(async {
         let mesh = SessionArguments::connecting(zenoh.clone(), connect.clone());
         let session = mesh.open().await?;
-        let serving = serve(*listen, session.clone()).await?;
+        let page = Page::open(*listen, session.clone()).await?;
+        println!("{}", page.address);
         tokio::select! {
-            ended = serving => ended?,
+            ended = page.serve() => ended?,
             signal = tokio::signal::ctrl_c() => signal.context("cannot wait for Ctrl-C")?,
         }
         session.close().await.ok();
@@ -59,23 +68,51 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     })
 }
 
-/// Listens and prints the address; the future that it returns serves.
-pub(super) async fn serve(
-    listen: SocketAddr,
-    session: Session,
-) -> anyhow::Result<impl Future<Output = anyhow::Result<()>>> {
-    let listener = TcpListener::bind(listen).await;
-    let listener = listener.with_context(|| format!("cannot listen on {listen}"))?;
-    let address = listener.local_addr().context("the page has no address")?;
-    let guard = Guard::of(address.ip()).context("cannot make a token")?;
-    println!("http://{address}/{}", guard.suffix());
-    let router = router(Arc::new(Site { session, guard }));
-    Ok(async move { axum::serve(listener, router).await.context("cannot serve the page") })
+/// A server that listens.
+pub(super) struct Page {
+    listener: TcpListener,
+    site: Site,
+    /// What to open, with the token if there is one.
+    pub(super) address: String,
+}
+
+impl Page {
+    /// Listens to requests and to the mesh.
+    pub(super) async fn open(listen: SocketAddr, session: Session) -> anyhow::Result<Self> {
+        let listener = TcpListener::bind(listen).await.with_context(|| {
+            format!("cannot listen on {listen}; --listen 127.0.0.1:0 takes a port that is free")
+        })?;
+        let bound = listener.local_addr().context("the page has no address")?;
+        let guard = Guard::of(bound.ip()).context("cannot make a token")?;
+        let reached = SocketAddr::new(reached_as(bound.ip()), bound.port());
+        let address = format!("http://{reached}/{}", guard.suffix());
+        let fleet = Arc::new(Fleet::of(session).await?);
+        Ok(Self { listener, site: Site { fleet, guard }, address })
+    }
+
+    /// Answers requests; does not end by itself.
+    pub(super) async fn serve(self) -> anyhow::Result<()> {
+        let router = router(Arc::new(self.site));
+        axum::serve(self.listener, router).await.context("cannot serve the page")
+    }
+}
+
+/// By which address others reach a server that listens on all: that of the way out.
+fn reached_as(bound: IpAddr) -> IpAddr {
+    if !bound.is_unspecified() {
+        return bound;
+    }
+    // Nothing is sent: the socket only learns its own address. The other is for documentation.
+    let way_out = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).and_then(|socket| {
+        socket.connect((Ipv4Addr::new(192, 0, 2, 1), 9))?;
+        socket.local_addr()
+    });
+    way_out.map_or(IpAddr::V4(Ipv4Addr::LOCALHOST), |address| address.ip())
 }
 
 /// What all requests share.
 struct Site {
-    session: Session,
+    fleet: Arc<Fleet>,
     guard: Guard,
 }
 
@@ -130,8 +167,8 @@ async fn socket(
         Ok(robot) => robot,
         Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
     };
-    let session = site.session.clone();
-    upgrade.on_upgrade(move |socket| page::talk(socket, session, robot))
+    let fleet = site.fleet.clone();
+    upgrade.on_upgrade(move |socket| page::talk(socket, fleet, robot))
 }
 
 async fn map(
@@ -143,8 +180,7 @@ async fn map(
         let reason = format!("a map is png, pgm or yaml, not {format:?}");
         return (StatusCode::NOT_FOUND, reason).into_response();
     }
-    let question = ("map", format!("format={format}"));
-    match asked(&site, &whom, (question.0, &question.1)).await {
+    match asked(&site, &whom, ("map", &format!("format={format}"))).await {
         Ok(bytes) => {
             let name = format!("attachment; filename=\"map.{format}\"");
             ([(header::CONTENT_DISPOSITION, name)], bytes).into_response()
@@ -185,5 +221,5 @@ async fn command(
 
 async fn asked(site: &Site, whom: &Whom, question: (&str, &str)) -> anyhow::Result<Vec<u8>> {
     let robot = Prefix::parse(whom.robot.as_deref().context("no robot is named")?)?;
-    Ok(mesh::ask_robot(&site.session, &robot, question).await?.bytes)
+    Ok(mesh::ask_robot(site.fleet.session(), &robot, question).await?.bytes)
 }

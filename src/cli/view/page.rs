@@ -1,150 +1,138 @@
 //! What one open page is told.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::ws::{Message, WebSocket};
-use bytes::Bytes;
-use gmapd::client::{MapMirror, MirrorState};
+use gmapd::client::MirrorState;
 use gmapd::daemon::keys::Prefix;
 use gmapd::map::mirror::MirroredMap;
 use gmapd::map::tiles::{self, TileIndex};
 use serde_json::{Value, json};
 use tokio::sync::watch;
-use tokio::task::JoinSet;
-use tokio::time::sleep;
-use zenoh::Session;
+use tokio::time::timeout;
 
-use crate::cli::mesh;
+use super::fleet::{Fleet, Robots};
+use super::robot::Scene;
 
-/// Between questions to the robot that is looked at.
-const PERIOD: Duration = Duration::from_millis(500);
+/// A page that takes nothing for so long is gone, and opens the socket anew if it is not.
+const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Tells a page about a robot until it is closed.
+/// Tells a page who is there, and about a robot, until it is closed.
 ///
 /// A page that reads slowly is told the newest of everything when it reads again: nothing waits for
 /// it anywhere.
-pub(super) async fn talk(mut socket: WebSocket, session: Session, robot: Option<Prefix>) {
-    let mirror = match &robot {
-        Some(robot) => MapMirror::follow(&session, robot).await.ok(),
+pub(super) async fn talk(mut socket: WebSocket, fleet: Arc<Fleet>, robot: Option<Prefix>) {
+    let watched = match &robot {
+        Some(robot) => match fleet.watch(robot).await {
+            Ok(watched) => Some(watched),
+            Err(error) => {
+                tracing::warn!("{robot} cannot be watched: {error:#}");
+                return;
+            }
+        },
         None => None,
     };
-    let (news, newest) = watch::channel(Value::Null);
-    let (paths, path) = watch::channel(Value::Null);
-    let mut tasks = JoinSet::new();
-    tasks.spawn(ask(session, robot, Told { news, paths }));
-    let states = mirror.as_ref().map(MapMirror::states);
-    tell(&mut socket, Heard { newest, path, states }).await.ok();
+    let heard = Heard {
+        robots: fleet.robots(),
+        scene: watched.as_ref().map(|watched| watched.scene.clone()),
+        map: watched.as_ref().map(|watched| watched.mirror.states()),
+    };
+    // What is there already is news to this page.
+    tell(&mut socket, heard.all_new()).await.ok();
 }
 
 /// Where what was heard waits for the page.
 struct Heard {
-    newest: watch::Receiver<Value>,
-    path: watch::Receiver<Value>,
-    states: Option<watch::Receiver<MirrorState>>,
+    robots: watch::Receiver<Robots>,
+    scene: Option<watch::Receiver<Scene>>,
+    map: Option<watch::Receiver<MirrorState>>,
 }
 
-async fn tell(socket: &mut WebSocket, mut heard: Heard) -> Result<(), axum::Error> {
+impl Heard {
+    fn all_new(mut self) -> Self {
+        self.robots.mark_changed();
+        self.scene.iter_mut().for_each(watch::Receiver::mark_changed);
+        self.map.iter_mut().for_each(watch::Receiver::mark_changed);
+        self
+    }
+}
+
+/// The page is gone, or as good as gone.
+struct Gone;
+
+async fn tell(socket: &mut WebSocket, mut heard: Heard) -> Result<(), Gone> {
     let mut sent = Sent::default();
     loop {
-        tokio::select! {
+        let messages = tokio::select! {
             message = socket.recv() => match message {
-                Some(Ok(_)) => {}
-                Some(Err(error)) => return Err(error),
-                None => return Ok(()),
+                Some(Ok(_)) => Vec::new(),
+                Some(Err(_)) | None => return Err(Gone),
             },
-            Ok(()) = heard.newest.changed() => {
-                let text = heard.newest.borrow_and_update().to_string();
-                socket.send(Message::Text(text.into())).await?;
+            Ok(()) = heard.robots.changed() => {
+                vec![text(&robots(&heard.robots.borrow_and_update()))]
             }
-            Ok(()) = heard.path.changed() => {
-                let text = heard.path.borrow_and_update().to_string();
-                socket.send(Message::Text(text.into())).await?;
-            }
-            Some(map) = changed(&mut heard.states) => {
-                for message in sent.update(&map) {
-                    socket.send(message).await?;
-                }
-            }
+            Some(scene) = newest(&mut heard.scene) => sent.scene(scene),
+            Some(state) = newest(&mut heard.map) => sent.map(&state.map),
             else => return Ok(()),
+        };
+        for message in messages {
+            let taken = timeout(PATIENCE, socket.send(message)).await;
+            taken.map_err(|_| Gone)?.map_err(|_| Gone)?;
         }
     }
 }
 
-async fn changed(
-    states: &mut Option<watch::Receiver<MirrorState>>,
-) -> Option<std::sync::Arc<MirroredMap>> {
-    let Some(states) = states else { return std::future::pending().await };
-    states.changed().await.ok()?;
-    Some(states.borrow_and_update().map.clone())
+/// Never, if there is none.
+async fn newest<T: Clone>(receiver: &mut Option<watch::Receiver<T>>) -> Option<T> {
+    let Some(receiver) = receiver else { return std::future::pending().await };
+    receiver.changed().await.ok()?;
+    Some(receiver.borrow_and_update().clone())
 }
 
-/// The tiles that a page has.
+fn robots(robots: &Robots) -> Value {
+    let robot = |(name, is_alive)| json!({ "name": name, "is_alive": is_alive });
+    json!({ "robots": robots.iter().map(robot).collect::<Vec<_>>() })
+}
+
+fn text(value: &Value) -> Message {
+    Message::Text(value.to_string().into())
+}
+
+/// What a page has.
 #[derive(Default)]
 struct Sent {
+    scene: Scene,
+    /// Run and version of the map.
     version: (u64, u64),
-    hashes: BTreeMap<TileIndex, u64>,
+    tiles: BTreeMap<TileIndex, u64>,
 }
 
 impl Sent {
+    fn scene(&mut self, scene: Scene) -> Vec<Message> {
+        let news = scene.iter().filter(|(kind, text)| self.scene.get(*kind) != Some(text));
+        let messages = news.map(|(_, text)| Message::Text(text.clone())).collect();
+        self.scene = scene;
+        messages
+    }
+
     /// What the page lacks of a version; tiles that are no more make it begin anew.
-    fn update(&mut self, map: &MirroredMap) -> Vec<Message> {
+    fn map(&mut self, map: &MirroredMap) -> Vec<Message> {
         let version = (map.run(), map.version());
         if std::mem::replace(&mut self.version, version) == version {
             return Vec::new();
         }
-        let hashes: BTreeMap<_, _> = map.entries().map(|tile| (tile.index, tile.hash)).collect();
+        let tiles: BTreeMap<_, _> = map.entries().map(|tile| (tile.index, tile.hash)).collect();
         let mut messages = Vec::new();
-        if self.hashes.keys().any(|index| !hashes.contains_key(index)) {
-            self.hashes.clear();
-            messages.push(Message::Text(json!({ "clear": true }).to_string().into()));
+        if self.tiles.keys().any(|index| !tiles.contains_key(index)) {
+            self.tiles.clear();
+            messages.push(text(&json!({ "clear": true })));
         }
-        let lacks = |tile: &tiles::Entry| self.hashes.get(&tile.index) != Some(&tile.hash);
+        let lacks = |tile: &tiles::Entry| self.tiles.get(&tile.index) != Some(&tile.hash);
         let packed = tiles::Message::pack(map.head(), map.entries().filter(lacks));
-        messages.extend(packed.into_iter().map(|bytes: Bytes| Message::Binary(bytes)));
-        self.hashes = hashes;
+        messages.extend(packed.into_iter().map(Message::Binary));
+        self.tiles = tiles;
         messages
     }
-}
-
-struct Told {
-    news: watch::Sender<Value>,
-    paths: watch::Sender<Value>,
-}
-
-async fn ask(session: Session, robot: Option<Prefix>, told: Told) {
-    let mut version = Value::Null;
-    loop {
-        let robots = mesh::alive(&session).await.unwrap_or_default();
-        let robots: Vec<String> = robots.iter().map(Prefix::to_string).collect();
-        let Some(robot) = &robot else {
-            told.news.send_replace(json!({ "robots": robots }));
-            sleep(PERIOD).await;
-            continue;
-        };
-        let status = json_of(&session, robot, "slam/status").await;
-        let particles = json_of(&session, robot, "particlecloud").await;
-        if status["map"]["version"] != version {
-            version = status["map"]["version"].clone();
-            let path = json_of(&session, robot, "path").await;
-            told.paths.send_replace(json!({ "path": flat(&path["poses"], "/pose/position") }));
-        }
-        let particles = flat(&particles["poses"], "/position");
-        let news = json!({ "robots": robots, "status": status, "particles": particles });
-        told.news.send_replace(news);
-        sleep(PERIOD).await;
-    }
-}
-
-/// `null` if nobody answers.
-async fn json_of(session: &Session, robot: &Prefix, name: &str) -> Value {
-    let Ok(key) = robot.key(name) else { return Value::Null };
-    let answer = mesh::ask(session, key.as_str()).await.ok().flatten();
-    answer.and_then(|answer| serde_json::from_slice(&answer.bytes).ok()).unwrap_or_default()
-}
-
-/// x, y, x, y ... of the points of poses.
-fn flat(poses: &Value, position: &str) -> Vec<f64> {
-    let points = poses.as_array().into_iter().flatten().filter_map(|pose| pose.pointer(position));
-    points.flat_map(|point| ["x", "y"].map(|axis| point[axis].as_f64().unwrap_or(0.0))).collect()
 }
