@@ -304,10 +304,7 @@ impl Placer {
     }
 }
 
-fn hits<'a>(
-    scan: &'a Scan,
-    mount: &'a LaserMount,
-) -> impl Iterator<Item = Point2> + 'a {
+fn hits<'a>(scan: &'a Scan, mount: &'a LaserMount) -> impl Iterator<Item = Point2> + 'a {
     let step = scan.ranges.len().div_ceil(MOST_POINTS).max(1);
     let beams = scan.ranges.iter().enumerate().step_by(step);
     beams.filter_map(move |(index, &range)| match scan.geometry.classify(range) {

@@ -174,7 +174,7 @@ function showStatus(status) {
 }
 
 const pose = ({ x, y, theta }) =>
-  `${x.toFixed(2)} m, ${y.toFixed(2)} m, ${(theta * 180 / Math.PI).toFixed(0)}°`;
+  `${x.toFixed(2)} m, ${y.toFixed(2)} m, ${Math.round(theta * 180 / Math.PI) || 0}°`;
 
 function showState(kind, word, detail) {
   element("state").className = kind;
