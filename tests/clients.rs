@@ -10,6 +10,7 @@ use tempfile::TempDir;
 use self::processes::{Background, Daemon, ROUTER, directory, endpoint, file, gmapd, program};
 use self::processes::{simulated_log, succeed, text};
 
+#[expect(dead_code, reason = "other tests use the rest")]
 mod processes;
 
 /// What it complained about.

@@ -13,7 +13,7 @@ use gmapd::ros::graph::POSE_WITH_COVARIANCE_STAMPED;
 use gmapd::ros::graph::rmw_zenoh::{Graph, TypeHashes};
 use gmapd::slam::pose::{Point2, Pose2};
 use gmapd::slam::scan::{Beam, LaserMount, Scan};
-use gmapd::timeline::Timeline;
+use gmapd::timeline::{Missing, Timeline};
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -38,8 +38,8 @@ const POSES_A_STATUS: usize = 500;
 /// More beams than this make no clearer picture.
 const MOST_POINTS: usize = 720;
 
-/// Of the poses that scans are placed by.
-const KEPT_POSES: (Duration, usize) = (Duration::from_secs(5), 1024);
+/// Of the poses that scans are placed by; a log may be played much faster than it was recorded.
+const KEPT_POSES: (Duration, usize) = (Duration::from_secs(60), 1024);
 
 /// Poses and scans that wait to be read; more are lost.
 const WAITING: usize = 256;
@@ -297,8 +297,12 @@ impl Placer {
 
     fn placed(&self, sample: &Sample) -> Option<Value> {
         let scan = convert::scan(decode::<ros::LaserScan>(sample)?).ok()?;
-        // A robot that stands tells no new poses.
-        let map_from_base = self.poses.at(scan.stamp).ok().or(self.pose)?;
+        let map_from_base = match self.poses.at(scan.stamp) {
+            Ok(pose) => pose,
+            // A robot that stands tells no new poses.
+            Err(Missing::TooNew(_)) => self.pose?,
+            Err(Missing::Empty | Missing::TooOld(_)) => return None,
+        };
         let points = hits(&scan, &self.mount).map(|point| map_from_base * point);
         Some(flat(points.map(|point| (point.x, point.y))))
     }
