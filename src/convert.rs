@@ -148,6 +148,15 @@ pub fn odometry(message: ros::Odometry) -> Result<OdometrySample, ConvertError> 
     })
 }
 
+/// The pose that a message of odometry brings: by way of a quaternion, its last bits may change.
+/// One that no message can carry stays as it is, for the filter to refuse.
+#[must_use]
+pub fn odometry_as_received(stamp: Stamp, odom_from_base: Pose2) -> Pose2 {
+    let (odom_frame, base_frame) = (String::new(), String::new());
+    let sample = OdometrySample { stamp, odom_frame, base_frame, odom_from_base };
+    odometry(odometry_message(&sample)).map_or(odom_from_base, |received| received.odom_from_base)
+}
+
 /// What odometry says as the message that [`odometry`] reads; it knows no speed.
 #[must_use]
 pub fn odometry_message(sample: &OdometrySample) -> ros::Odometry {

@@ -5,29 +5,26 @@
 
 mod choice;
 mod survey;
+mod synchronized;
 mod tree;
 
-use std::collections::VecDeque;
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 use thiserror::Error;
 
 pub use self::choice::{ChoiceError, Topics, Unclear, Wanted};
 use self::survey::Survey;
-use crate::clock;
+pub use self::synchronized::Sweeps;
+use self::synchronized::Synchronized;
 use crate::config::Config;
 use crate::convert;
 use crate::daemon::frames::{FrameNames, Frames};
 use crate::daemon::ledger::Verdict;
-use crate::daemon::synchronizer::{
-    self, Call, Channel, FramedScan, Need, ReadyScan, Refusal, Sought, Synchronizer,
-};
+use crate::daemon::synchronizer::{Channel, Refusal};
 use crate::logs::recording::{Kind, Message, Messages, RawMessage, Recording, RecordingError};
 use crate::logs::{Fault, LogStatistics, Reading};
 use crate::ros;
-use crate::slam::pose::{Pose2, Stamp};
-use crate::slam::scan::LaserMount;
+use crate::slam::pose::Stamp;
 use crate::tf;
 
 /// Why a recording cannot be used.
@@ -115,31 +112,18 @@ impl Recorded {
     /// What the filter is to take, in its order.
     #[must_use]
     pub fn readings(&self, config: &Config) -> Readings {
-        let raw = &config.raw;
-        let Topics { odometry, transforms, .. } = &self.topics;
+        let Topics { odometry, transforms, source, .. } = &self.topics;
         let odom_key = odometry.clone().unwrap_or_else(|| "a topic of odometry".to_owned());
         let FrameNames { base, odom } = &self.frames;
-        let synchronizer = Synchronizer::new(synchronizer::Settings {
-            odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
-            most_waiting: raw.scan_queue,
-            sweep_time_s: raw.sweep_time_s,
-            source: self.topics.source,
-            sought: Sought::Odometry,
-            need: Need::Required,
-            odom_key,
-            tf_path: format!("{} (from `{odom}` to `{base}`)", transforms.join(", ")),
-        });
+        let tf_path = format!("{} (from `{odom}` to `{base}`)", transforms.join(", "));
+        let settings = synchronized::settings(config, *source, odom_key, tf_path);
         let tf_static = "/tf_static".to_owned();
+        let frames = Frames::new(self.frames.clone(), config.laser_mount(), tf_static);
         Readings {
             messages: self.recording.messages(),
             topics: self.topics.clone(),
-            frames: Frames::new(self.frames.clone(), config.laser_mount(), tf_static),
-            synchronizer,
-            start: None,
+            synchronized: Synchronized::new(frames, settings),
             number: 0,
-            ended: false,
-            odometry: None,
-            ready: VecDeque::new(),
         }
     }
 }
@@ -158,16 +142,9 @@ pub enum Event {
 pub struct Readings {
     messages: Messages,
     topics: Topics,
-    frames: Frames,
-    synchronizer: Synchronizer,
-    /// The time of the first message, and what stands for it.
-    start: Option<(Stamp, Instant)>,
+    synchronized: Synchronized,
     /// Of the message read last, from 1.
     number: u64,
-    ended: bool,
-    /// Odometry that the next scan may bring again.
-    odometry: Option<(Stamp, Pose2)>,
-    ready: VecDeque<Event>,
 }
 
 impl Iterator for Readings {
@@ -175,70 +152,29 @@ impl Iterator for Readings {
 
     fn next(&mut self) -> Option<Event> {
         loop {
-            if let Some(event) = self.ready.pop_front() {
+            if let Some(event) = self.synchronized.next_event() {
                 return Some(event);
             }
-            if let Some(call) = self.synchronizer.next_call() {
-                self.make(call);
-            } else if let Some(message) = self.messages.next() {
+            if let Some(message) = self.messages.next() {
                 self.number += 1;
                 self.take(&message);
-            } else if self.ended {
+            } else if !self.synchronized.finish() {
                 return None;
-            } else {
-                self.ended = true;
-                self.synchronizer.finish(&self.frames);
             }
         }
     }
 }
 
 impl Readings {
-    fn make(&mut self, call: Call) {
-        match call {
-            Call::Odometry(stamp, odom_from_base) => {
-                self.give_odometry();
-                self.odometry = Some((stamp, odom_from_base));
-            }
-            Call::Scan(ReadyScan { scan, mount, odom_from_base }) => {
-                let stamp = scan.stamp;
-                // None only if the configuration wants none, and then nobody looks at it.
-                let odom_from_base = odom_from_base.unwrap_or_default();
-                // The odometry of a scan comes with it, and once is enough.
-                self.odometry.take_if(|odometry| *odometry == (stamp, odom_from_base));
-                self.give_odometry();
-                let line = self.number;
-                let reading = Reading { line, stamp, odom_from_base, scan: Some(scan), mount };
-                self.ready.push_back(Event::Reading(reading));
-            }
-            Call::Refuse(refusal) => self.ready.push_back(Event::Refused(refusal)),
-        }
-    }
-
-    fn give_odometry(&mut self) {
-        if let Some((stamp, odom_from_base)) = self.odometry.take() {
-            let (line, mount) = (self.number, LaserMount::default());
-            let reading = Reading { line, stamp, odom_from_base, scan: None, mount };
-            self.ready.push_back(Event::Reading(reading));
-        }
-    }
-
     fn take(&mut self, message: &RawMessage) {
         if !self.topics.uses(&message.topic) {
             return;
         }
-        let now = self.now(message.log_time);
-        while self.synchronizer.deadline().is_some_and(|deadline| deadline <= now) {
-            let waiting = self.synchronizer.waiting();
-            self.synchronizer.expire(now, &self.frames);
-            if self.synchronizer.waiting() == waiting {
-                break;
-            }
-        }
+        self.synchronized.advance(self.number, message.log_time);
         // What cannot be decoded was told by the survey.
         let Ok(content) = message.decode() else { return };
         match content {
-            Message::LaserScan(scan) => self.take_scan(scan, now),
+            Message::LaserScan(scan) => self.take_scan(scan, message.log_time),
             Message::Odometry(odometry) => self.take_odometry(*odometry),
             Message::Transforms(transforms) => {
                 let fixed = message.topic.kind == Kind::StaticTransforms;
@@ -250,21 +186,14 @@ impl Readings {
         }
     }
 
-    /// The time of a message on a clock that starts with the first.
-    fn now(&mut self, log_time: Stamp) -> Instant {
-        let (first, start) = *self.start.get_or_insert_with(|| (log_time, clock::now()));
-        let passed = log_time.0.saturating_sub(first.0);
-        start + Duration::from_nanos(u64::try_from(passed).unwrap_or(0))
-    }
-
-    fn take_scan(&mut self, message: ros::LaserScan, now: Instant) {
+    fn take_scan(&mut self, message: ros::LaserScan, time: Stamp) {
         let frame = message.header.frame_id.clone();
         let stamp = convert::stamp(message.header.stamp).ok();
         match convert::scan(message) {
-            Ok(scan) => self.synchronizer.scan(FramedScan { scan, frame }, now, &self.frames),
+            Ok(scan) => self.synchronized.scan(scan, frame, time),
             Err(error) => {
                 let (verdict, detail) = (Verdict::BadGeometry, error.to_string());
-                self.ready.push_back(Event::Refused(Refusal { stamp, verdict, detail }));
+                self.synchronized.refuse(Refusal { stamp, verdict, detail });
             }
         }
     }
@@ -272,20 +201,20 @@ impl Readings {
     fn take_odometry(&mut self, message: ros::Odometry) {
         if let Ok(sample) = convert::odometry(message) {
             let odometry = (sample.stamp, sample.odom_from_base);
-            self.synchronizer.odometry(Channel::Messages, odometry, &self.frames);
+            self.synchronized.odometry(Channel::Messages, odometry);
         }
     }
 
     fn take_transform(&mut self, message: ros::TransformStamped, kind: tf::Kind) {
         let Ok(transform) = convert::transform(message) else { return };
-        if self.frames.insert(&transform, kind).is_err() {
+        if self.synchronized.frames.insert(&transform, kind).is_err() {
             return;
         }
-        for (stamp, odom_from_base) in self.frames.new_odometry() {
+        for (stamp, odom_from_base) in self.synchronized.frames.new_odometry() {
             if let Ok(pose) = odom_from_base {
-                self.synchronizer.odometry(Channel::Transforms, (stamp, pose), &self.frames);
+                self.synchronized.odometry(Channel::Transforms, (stamp, pose));
             }
         }
-        self.synchronizer.frames_changed(&self.frames);
+        self.synchronized.frames_changed();
     }
 }

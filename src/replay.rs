@@ -16,7 +16,7 @@ pub use summary::{
 
 use crate::clock::{Elapsed, Stopwatch};
 use crate::config::{Config, OdometrySource};
-use crate::convert::{self, OdometrySample};
+use crate::convert;
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
 use crate::slam::engine::{Engine, Sweep};
@@ -65,7 +65,12 @@ impl Replay {
     pub fn add(&mut self, reading: &Reading) -> Verdict {
         let mount = mount_as_received(&reading.mount);
         let scan = reading.scan.as_ref().map(scan_as_received);
-        self.take(reading.stamp, odometry_as_received(reading), scan.as_ref(), &mount)
+        self.take(
+            reading.stamp,
+            convert::odometry_as_received(reading.stamp, reading.odom_from_base),
+            scan.as_ref(),
+            &mount,
+        )
     }
 
     /// Takes the next reading as messages have brought it.
@@ -159,18 +164,6 @@ impl Replay {
         self.resamples += u64::from(report.resampled);
         self.weak += u64::from(report.weak_direction.is_some());
     }
-}
-
-/// A pose that no message can carry is left to the filter to refuse.
-fn odometry_as_received(reading: &Reading) -> Pose2 {
-    let sample = OdometrySample {
-        stamp: reading.stamp,
-        odom_frame: String::new(),
-        base_frame: String::new(),
-        odom_from_base: reading.odom_from_base,
-    };
-    let received = convert::odometry(convert::odometry_message(&sample));
-    received.map_or(sample.odom_from_base, |received| received.odom_from_base)
 }
 
 fn scan_as_received(scan: &Scan) -> Option<Scan> {

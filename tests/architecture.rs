@@ -83,7 +83,7 @@ const MAY_USE: [(&str, &[&str]); 20] = [
     (
         "doctor",
         // Its tests watch simulated robots.
-        &["convert", "playback", "ros", "sim", "slam", "statistics", "tf", "timeline"],
+        &["config", "convert", "playback", "ros", "sim", "slam", "statistics", "tf", "timeline"],
     ),
     ("map", &["slam", "statistics"]),
     ("evaluation", &["slam", "statistics"]),

@@ -37,7 +37,11 @@ fn sha256(bytes: &[u8]) -> String {
 
 /// The hashes that `gmapd replay` tells of a log.
 fn replayed(log: &Path) -> Value {
-    let summary = succeed(&["replay", text(log), "--json"]);
+    replayed_with(log, &[])
+}
+
+fn replayed_with(log: &Path, arguments: &[&str]) -> Value {
+    let summary = succeed(&[&["replay", text(log), "--json"], arguments].concat());
     let mut summary: Value = serde_json::from_str(&summary).expect("--json prints JSON");
     summary["sha256"].take()
 }
@@ -63,6 +67,19 @@ fn playing_a_log_gives_the_map_and_path_that_replaying_it_gives() {
         assert_eq!(answered(&daemon, "map", "map.pgm"), expected["map.pgm"], "rate {rate}");
         assert_eq!(answered(&daemon, "path", "path.tum"), expected["path.tum"], "rate {rate}");
     }
+}
+
+#[test]
+fn a_log_of_sweeps_is_played_and_replayed_alike() {
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let sweeps = ["--set", "sweep_time_s=0.1"];
+    let expected = replayed_with(&log, &sweeps);
+    assert_ne!(expected["map.pgm"], replayed(&log)["map.pgm"], "motion during sweeps matters");
+    let daemon = Daemon::start_with("robot01", &sweeps);
+    daemon.play(&[text(&log), "--prefix", "robot01", "--rate", "max"]);
+    assert_eq!(answered(&daemon, "map", "map.pgm"), expected["map.pgm"]);
+    assert_eq!(answered(&daemon, "path", "path.tum"), expected["path.tum"]);
 }
 
 /// Once by the daemon itself, and once beside it.

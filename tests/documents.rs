@@ -8,7 +8,7 @@ use gmapd::config::RawConfig;
 use serde_json::Value;
 
 /// Documents whose file names must be there.
-const DOCUMENTS: [&str; 8] = [
+const DOCUMENTS: [&str; 9] = [
     "README.md",
     "CHANGELOG.md",
     "docs/architecture.md",
@@ -16,6 +16,7 @@ const DOCUMENTS: [&str; 8] = [
     "docs/mesh.md",
     "docs/parameters.md",
     "docs/ros2.md",
+    "docs/security.md",
     "bridge/README.md",
 ];
 

@@ -12,7 +12,7 @@ use gmapd::daemon::synchronizer::Refusal;
 use gmapd::logs::carmen::CarmenLog;
 use gmapd::logs::recording::{self, Format, Recording};
 use gmapd::logs::{LogError, LogStatistics};
-use gmapd::recorded::{Event, Recorded, Topics, Wanted};
+use gmapd::recorded::{Event, Recorded, Sweeps, Topics, Wanted};
 
 /// Malformed lines and damaged places that are told one by one.
 const FAULTS_SHOWN: usize = 10;
@@ -26,6 +26,16 @@ pub(super) struct TopicArguments {
     /// Topic of odometry, nav_msgs/Odometry or transforms, where a recording has several
     #[arg(long, value_name = "TOPIC")]
     odom: Option<String>,
+}
+
+/// What comes next, or why no more can be read.
+pub(super) type Events<'a> = Box<dyn Iterator<Item = Result<Event, LogError>> + 'a>;
+
+/// Which poses of a CARMEN log go in with its scans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Along {
+    Odometry,
+    CorrectedPoses,
 }
 
 /// A recorded run.
@@ -64,16 +74,24 @@ impl Log {
     }
 
     /// What the filter is to take, in its order.
-    pub(super) fn events<'a>(
-        &'a self,
-        config: &Config,
-    ) -> Result<Box<dyn Iterator<Item = Result<Event, LogError>> + 'a>, LogError> {
-        match self {
-            Self::Carmen(log) => {
-                Ok(Box::new(log.readings()?.map(|reading| reading.map(Event::Reading))))
-            }
-            Self::Recorded(recorded) => Ok(Box::new(recorded.readings(config).map(Ok))),
+    pub(super) fn events(&self, config: &Config, along: Along) -> Result<Events<'_>, LogError> {
+        let log = match self {
+            Self::Carmen(log) => log,
+            Self::Recorded(recorded) => return Ok(Box::new(recorded.readings(config).map(Ok))),
+        };
+        let readings: Box<dyn Iterator<Item = _>> = match along {
+            Along::Odometry => Box::new(log.readings()?),
+            Along::CorrectedPoses => Box::new(log.corrected_readings()?),
+        };
+        if has_sweeps(config) {
+            return Ok(Box::new(Sweeps::new(readings, config)));
         }
+        Ok(Box::new(readings.map(|reading| reading.map(Event::Reading))))
+    }
+
+    /// Whether its readings have been messages, or are as a synchronizer makes them of such.
+    pub(super) fn is_received(&self, config: &Config) -> bool {
+        matches!(self, Self::Recorded(_)) || has_sweeps(config)
     }
 
     /// Tells what is used, and what could not be read.
@@ -91,6 +109,11 @@ impl Log {
             }
         }
     }
+}
+
+/// CARMEN's scans do not say how long a sweep takes; the configuration may.
+fn has_sweeps(config: &Config) -> bool {
+    config.raw.sweep_time_s.is_some_and(|seconds| seconds > 0.0)
 }
 
 /// What is used of a recording, in words.

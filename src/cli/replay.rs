@@ -21,7 +21,7 @@ use gmapd::replay::{Hashes, Outcome, PhaseTimes, Replay, Run, Summary};
 use gmapd::slam::pose::Point2;
 use sha2::{Digest as _, Sha256};
 
-use super::log::{Log, Refusals, TopicArguments};
+use super::log::{Along, Log, Refusals, TopicArguments};
 use super::progress::Progress;
 
 /// What to replay, and how.
@@ -98,8 +98,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let watch = Stopwatch::start();
     let replay = Replay::new(&config, threads)?;
     let outcome = match poses(arguments, &config)? {
-        Poses::Odometry => along_odometry(&log, &config, replay)?,
-        Poses::OfLog => along_corrected_poses(&log, &config, replay)?,
+        Poses::Odometry => along(Along::Odometry, &log, &config, replay)?,
+        Poses::OfLog => along(Along::CorrectedPoses, &log, &config, replay)?,
         Poses::Given(poses) => along_given_poses(&log, &config, replay, &poses)?,
     };
     let elapsed = watch.elapsed();
@@ -158,35 +158,19 @@ fn poses(arguments: &Arguments, config: &Config) -> anyhow::Result<Poses> {
     }
 }
 
-fn along_odometry(log: &Log, config: &Config, mut replay: Replay) -> anyhow::Result<Outcome> {
+fn along(poses: Along, log: &Log, config: &Config, mut replay: Replay) -> anyhow::Result<Outcome> {
     let mut progress = Progress::new(log.statistics());
     let mut refusals = Refusals::default();
-    for event in log.events(config)? {
+    for event in log.events(config, poses)? {
         match event? {
             Event::Reading(reading) => {
-                add(&mut replay, log, &reading);
+                add(&mut replay, log, config, &reading);
                 progress.advance(reading.stamp);
             }
             Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
     }
     refusals.warn();
-    progress.finish();
-    Ok(replay.finish())
-}
-
-fn along_corrected_poses(
-    log: &Log,
-    config: &Config,
-    mut replay: Replay,
-) -> anyhow::Result<Outcome> {
-    let Log::Carmen(carmen) = log else { return along_odometry(log, config, replay) };
-    let mut progress = Progress::new(log.statistics());
-    for reading in carmen.corrected_readings()? {
-        let reading = reading?;
-        replay.add(&reading);
-        progress.advance(reading.stamp);
-    }
     progress.finish();
     Ok(replay.finish())
 }
@@ -199,14 +183,14 @@ fn along_given_poses(
 ) -> anyhow::Result<Outcome> {
     let mut progress = Progress::new(log.statistics());
     let mut refusals = Refusals::default();
-    for event in log.events(config)? {
+    for event in log.events(config, Along::Odometry)? {
         match event? {
             Event::Reading(mut reading) => {
                 progress.advance(reading.stamp);
                 match poses.at(reading.stamp) {
                     Ok(map_from_base) => {
                         reading.odom_from_base = map_from_base;
-                        add(&mut replay, log, &reading);
+                        add(&mut replay, log, config, &reading);
                     }
                     Err(missing) if reading.scan.is_some() => {
                         let (stamp, detail) = (Some(reading.stamp), missing.to_string());
@@ -224,12 +208,13 @@ fn along_given_poses(
     Ok(replay.finish())
 }
 
-/// Recorded readings have been messages already.
-fn add(replay: &mut Replay, log: &Log, reading: &Reading) {
-    match log {
-        Log::Carmen(_) => replay.add(reading),
-        Log::Recorded(_) => replay.add_received(reading),
-    };
+/// Readings that have been messages already are taken as they are.
+fn add(replay: &mut Replay, log: &Log, config: &Config, reading: &Reading) {
+    if log.is_received(config) {
+        replay.add_received(reading);
+    } else {
+        replay.add(reading);
+    }
 }
 
 fn refuse(replay: &mut Replay, refusals: &mut Refusals, refusal: Refusal) {

@@ -11,6 +11,9 @@ use super::source::{Entries, Origin};
 /// A name this similar to an unknown one is suggested (Jaro-Winkler, 1 is equal).
 const SIMILAR: f64 = 0.75;
 
+/// Beyond, one message could take all memory of a small computer.
+const MOST_BYTES: f64 = 1e9;
+
 /// The configuration of all entries over the defaults.
 pub(super) fn resolve(entries: &Entries) -> Result<RawConfig, ConfigError> {
     check_keys(entries)?;
@@ -187,6 +190,10 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("occ_thresh", raw.occupied_threshold, Between(0.0, 1.0)),
         ("odometry_timeout_s", raw.odometry_timeout_s, Between(0.01, 5.0)),
         ("scan_queue", raw.scan_queue as f64, Between(1.0, 1000.0)),
+        ("commands_per_second", f64::from(raw.commands_per_second), Between(1.0, 1000.0)),
+        ("queries_at_once", raw.queries_at_once as f64, Between(1.0, 1000.0)),
+        ("max_message_bytes", raw.max_message_bytes as f64, Between(1024.0, MOST_BYTES)),
+        ("max_reply_bytes", raw.max_reply_bytes as f64, Between(65536.0, MOST_BYTES)),
         ("ros_domain_id", f64::from(raw.ros_domain_id), Between(0.0, 232.0)),
     ];
     let optional = [

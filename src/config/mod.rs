@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub use raw::{
-    EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher, OdometrySource, RawConfig, RosDistro,
-    Smoothing,
+    CommandName, EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher, OdometrySource, RawConfig,
+    RosDistro, Smoothing,
 };
 pub use source::Origin;
 

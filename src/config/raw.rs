@@ -52,6 +52,16 @@ pub struct RawConfig {
     pub save_directory: String,
     /// Name under which the map is saved when the daemon ends; left out, it is not.
     pub save_on_exit: Option<String>,
+    /// Commands that the mesh may give.
+    pub commands: Vec<CommandName>,
+    /// Commands that are done in a second.
+    pub commands_per_second: u32,
+    /// Queries that are answered at once.
+    pub queries_at_once: usize,
+    /// Bytes of a message above which it is not read.
+    pub max_message_bytes: usize,
+    /// Bytes of an answer above which it is refused.
+    pub max_reply_bytes: usize,
     /// File to which inputs and outputs are recorded, MCAP; left out, they are not.
     pub record: Option<String>,
 
@@ -272,6 +282,11 @@ impl Default for RawConfig {
             scan_queue: 32,
             save_directory: "maps".to_owned(),
             save_on_exit: None,
+            commands: CommandName::ALL.to_vec(),
+            commands_per_second: 10,
+            queries_at_once: 64,
+            max_message_bytes: 4 << 20,
+            max_reply_bytes: 64 << 20,
             record: None,
             max_range: core.max_range,
             max_usable_range: core.max_usable_range,
@@ -386,6 +401,28 @@ impl Default for Keys {
             tf_static: "tf_static".to_owned(),
         }
     }
+}
+
+/// What the mesh may ask for that changes something, as `slam/cmd/NAME`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CommandName {
+    /// Say where the robot is.
+    InitialPose,
+    /// Take no scans.
+    Pause,
+    /// Forget map and trajectory.
+    Reset,
+    /// Take scans again.
+    Resume,
+    /// Write the map to files.
+    Save,
+}
+
+impl CommandName {
+    /// All of them.
+    pub const ALL: [Self; 5] =
+        [Self::InitialPose, Self::Pause, Self::Reset, Self::Resume, Self::Save];
 }
 
 /// How ROS 2 nodes are met.

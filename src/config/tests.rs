@@ -75,15 +75,9 @@ fn each_style_of_slam_gmapping_file_loads() {
 }
 
 #[test]
-fn shipped_files_load_without_a_warning() {
-    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
-    let mut loaded = 0;
-    for entry in std::fs::read_dir(directory).unwrap() {
-        let config = Config::load(Some(&entry.unwrap().path()), &[]).unwrap();
-        assert_eq!(config.warnings, []);
-        loaded += 1;
-    }
-    assert!(loaded > 0);
+fn the_shipped_file_loads_without_a_warning() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/gmapd.yaml");
+    assert_eq!(Config::load(Some(&file), &[]).unwrap().warnings, []);
 }
 
 /// The shipped file differs from the defaults where it says so, and nowhere else.

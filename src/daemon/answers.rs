@@ -60,7 +60,16 @@ pub(super) enum Refusal {
     #[error(transparent)]
     Save(#[from] SaveError),
     #[error("a command is not done by a wildcard; ask {0} itself")]
-    Wildcard(String),
+    Wildcard(&'static str),
+    #[error("{0} is switched off on this robot: `commands` in its configuration does not have it")]
+    SwitchedOff(&'static str),
+    #[error("{0} commands were given in this second already; ask again")]
+    TooManyCommands(u32),
+    #[error(
+        "the answer has {bytes} bytes, and max_reply_bytes allows {most}; ask for a part with \
+         bbox=, or for larger cells with res="
+    )]
+    TooLarge { bytes: usize, most: usize },
     #[error("{0} queries are being answered already; ask again")]
     TooMany(usize),
     #[error("too many commands are waiting already; ask again")]

@@ -54,13 +54,17 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
+    use crate::config::EngineKind;
     use crate::daemon::ledger::Verdict;
+    use crate::daemon::links::LinksStatus;
     use crate::daemon::status::FilterStatus;
     use crate::slam::pose::Pose2;
     use crate::statistics::Spread;
 
     fn status(state: State) -> Status {
         Status {
+            engine: EngineKind::Gmapping,
+            links: LinksStatus::default(),
             version: "0.0.0",
             uptime_s: 1.0,
             state,

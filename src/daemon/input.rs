@@ -19,9 +19,6 @@ use crate::ros::graph::{LASER_SCAN, ODOMETRY, POSE_WITH_COVARIANCE_STAMPED, TF_M
 use crate::slam::pose::Stamp;
 use crate::tf::Kind;
 
-/// Payloads above this are not looked at: a sweep of 10000 beams has less than a tenth of it.
-const LARGEST_PAYLOAD: usize = 4 << 20;
-
 /// Bytes of one input that may wait to be decoded.
 const MOST_BYTES: usize = 32 << 20;
 
@@ -128,17 +125,20 @@ struct Raw {
 enum Content {
     Payload(ZBytes),
     /// So many bytes that they were let go.
-    TooLarge(usize),
+    TooLarge {
+        bytes: usize,
+        most: usize,
+    },
     /// Nothing: it says that there is nothing any more.
     Deleted,
 }
 
 impl Content {
-    fn of(sample: &Sample) -> Self {
-        let length = sample.payload().len();
+    fn of(sample: &Sample, most: usize) -> Self {
+        let bytes = sample.payload().len();
         match sample.kind() {
             SampleKind::Delete => Self::Deleted,
-            SampleKind::Put if length > LARGEST_PAYLOAD => Self::TooLarge(length),
+            SampleKind::Put if bytes > most => Self::TooLarge { bytes, most },
             SampleKind::Put => Self::Payload(sample.payload().clone()),
         }
     }
@@ -146,7 +146,7 @@ impl Content {
     fn len(&self) -> usize {
         match self {
             Self::Payload(payload) => payload.len(),
-            Self::TooLarge(_) | Self::Deleted => 0,
+            Self::TooLarge { .. } | Self::Deleted => 0,
         }
     }
 }
@@ -168,8 +168,9 @@ struct State {
 }
 
 /// What came and is not decoded yet, and how much came.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Inbox {
+    max_message_bytes: usize,
     state: Mutex<State>,
     changed: Notify,
 }
@@ -181,9 +182,15 @@ enum Next {
 }
 
 impl Inbox {
+    /// Messages of more bytes are counted and not kept.
+    #[must_use]
+    pub fn new(max_message_bytes: usize) -> Self {
+        Self { max_message_bytes, state: Mutex::default(), changed: Notify::new() }
+    }
+
     /// Takes a sample as it came. Never waits longer than it takes to move it.
     pub fn receive(&self, input: Input, sample: &Sample) {
-        self.put(input, Content::of(sample), sample.encoding().to_string());
+        self.put(input, Content::of(sample, self.max_message_bytes), sample.encoding().to_string());
     }
 
     fn put(&self, input: Input, content: Content, encoding: String) {
@@ -304,8 +311,8 @@ impl Decoder<'_> {
     fn take(&self, input: Input, content: &Content) {
         let reason = match content {
             Content::Payload(payload) => return self.decode(input, &payload.to_bytes()),
-            Content::TooLarge(length) => {
-                format!("the payload has {length} bytes; at most {LARGEST_PAYLOAD} are read")
+            Content::TooLarge { bytes, most } => {
+                format!("the payload has {bytes} bytes; max_message_bytes allows {most}")
             }
             Content::Deleted => "it is a delete, which is no message".to_owned(),
         };
@@ -418,7 +425,7 @@ mod tests {
 
     #[tokio::test]
     async fn scans_that_come_too_fast_are_counted_and_have_a_verdict() {
-        let inbox = Inbox::default();
+        let inbox = Inbox::new(4 << 20);
         (0..MOST_SCANS + 3).for_each(|_| put(&inbox, Input::Scan, 10));
         (0..=MOST_OTHERS).for_each(|_| put(&inbox, Input::Odom, 10));
         let tallies = [Input::Scan, Input::Odom].map(|input| inbox.tally(input));
@@ -430,10 +437,10 @@ mod tests {
 
     #[tokio::test]
     async fn memory_is_bounded_by_bytes_as_well() {
-        let inbox = Inbox::default();
-        (0..9).for_each(|_| put(&inbox, Input::Odom, LARGEST_PAYLOAD));
+        let inbox = Inbox::new(4 << 20);
+        (0..9).for_each(|_| put(&inbox, Input::Odom, 4 << 20));
         assert_eq!(inbox.tally(Input::Odom).dropped, 1);
-        inbox.put(Input::Scan, Content::TooLarge(LARGEST_PAYLOAD + 1), String::new());
+        inbox.put(Input::Scan, Content::TooLarge { bytes: 5 << 20, most: 4 << 20 }, String::new());
         inbox.put(Input::Scan, Content::Deleted, String::new());
         assert_eq!(inbox.lock().queues[&Input::Scan].bytes, 0);
         inbox.lock().queues.remove(&Input::Odom);
@@ -442,7 +449,7 @@ mod tests {
 
     #[tokio::test]
     async fn samples_are_decoded_in_the_order_of_arrival() {
-        let inbox = Inbox::default();
+        let inbox = Inbox::new(4 << 20);
         let order = [Input::Scan, Input::TfStatic, Input::Odom, Input::Scan, Input::Tf];
         order.iter().for_each(|input| put(&inbox, *input, 1));
         inbox.close();
@@ -455,7 +462,7 @@ mod tests {
 
     #[tokio::test]
     async fn any_bytes_are_a_rejection_and_no_panic() {
-        let inbox = Inbox::default();
+        let inbox = Inbox::new(4 << 20);
         for input in Input::ALL {
             for length in [0, 1, 3, 4, 5, 100] {
                 put(&inbox, input, length);

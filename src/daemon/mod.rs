@@ -14,6 +14,8 @@ pub mod input;
 mod judgement;
 pub mod keys;
 pub mod ledger;
+pub mod limits;
+pub mod links;
 pub mod mailbox;
 mod map_updates;
 pub mod mapper;
@@ -48,6 +50,7 @@ use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
 use self::keys::{InputKeys, KeyError, Prefix, plain_message};
 use self::ledger::Entry;
+use self::links::Links;
 use self::mailbox::Mailbox;
 use self::mapper::{Connections, Gauges, Mapper};
 use self::recorder::{Recorder, RecorderError};
@@ -118,6 +121,9 @@ pub enum DaemonError {
         /// What Zenoh says.
         reason: String,
     },
+    /// Zenoh does not tell of its links.
+    #[error("cannot watch the links of the session: {0}")]
+    Links(String),
     /// A bug: the thread `mapper` ended though nobody asked it to.
     #[error("the thread that maps ended unexpectedly")]
     MapperEnded,
@@ -191,6 +197,7 @@ pub struct Daemon {
     snapshots: watch::Receiver<Arc<Snapshot>>,
     verdicts: broadcast::Sender<Entry>,
     commands: mpsc::Sender<Request>,
+    links: Arc<Links>,
     status: Arc<StatusSource>,
     /// `None` before it has started and once stopped.
     serving: Option<Serving>,
@@ -223,6 +230,11 @@ impl Daemon {
         let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
         let keys = node.inputs(&config.raw.keys, Input::of_motion(&config))?;
         let mut daemon = Self::deaf(&config, &keys, threads)?;
+        daemon
+            .links
+            .watch(session)
+            .await
+            .map_err(|error| DaemonError::Links(plain_message(&error)))?;
         let sources = Sources {
             snapshots: daemon.snapshots(),
             verdicts: daemon.verdicts(),
@@ -239,9 +251,10 @@ impl Daemon {
     /// All threads and tasks of a daemon that hears and tells nothing yet.
     fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
         let saving = Saving::new(config)?;
-        let inbox = Arc::new(Inbox::default());
+        let inbox = Arc::new(Inbox::new(config.raw.max_message_bytes));
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
+        let links = Arc::new(Links::default());
         let (snapshot_sender, snapshots) = watch::channel(Arc::new(mapper::first_snapshot()));
         let verdicts = broadcast::Sender::new(VERDICTS_KEPT);
         let connections = Connections {
@@ -258,8 +271,9 @@ impl Daemon {
             mailbox: Arc::clone(&mailbox),
             gauges,
             snapshots: snapshots.clone(),
+            links: Arc::clone(&links),
         };
-        let status = Arc::new(StatusSource::new(keys.clone(), config.raw.seed, shared));
+        let status = Arc::new(StatusSource::new(keys.clone(), &config.raw, shared));
         let (commands, requests) = mpsc::channel(COMMANDS);
         let helpers = [
             tokio::spawn(forward(requests, Arc::clone(&mailbox))),
@@ -274,6 +288,7 @@ impl Daemon {
             snapshots,
             verdicts,
             commands,
+            links,
             status,
             serving: None,
             saving,

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytes::Bytes;
 use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::{JoinHandle, spawn_blocking};
@@ -12,15 +13,13 @@ use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait as _};
 
 use super::answers::{Answer, Refusal, Responder};
+use super::limits::{Limits, Rate};
 use super::ros_node::RosNode;
 use super::selector::Topic;
 use super::serving::ServingError;
 use crate::clock;
 use crate::ros::graph::GET_MAP;
 use crate::ros::graph::rmw_zenoh::Attachment;
-
-/// Queries that are answered at once. A reply to a slow client holds its place until it is sent.
-const ANSWERS_AT_ONCE: usize = 64;
 
 /// Maps that go out at once: one after the other, half of those who ask together have theirs in
 /// half of the time, and nobody waits longer.
@@ -52,6 +51,7 @@ enum Asker {
 pub(super) struct Queryables {
     declared: Vec<Queryable<()>>,
     counter: Counter,
+    queries_at_once: u32,
     refusals: JoinHandle<()>,
 }
 
@@ -66,6 +66,8 @@ struct Counter {
     turns: Arc<Semaphore>,
     commands: Arc<Semaphore>,
     refused: mpsc::Sender<Query>,
+    limits: Arc<Limits>,
+    rate: Arc<Rate>,
     runtime: Handle,
 }
 
@@ -75,14 +77,18 @@ impl Queryables {
         session: &Session,
         node: &mut RosNode,
         responder: Arc<Responder>,
+        limits: Limits,
     ) -> Result<Self, ServingError> {
         let (refused, waiting) = mpsc::channel(REFUSALS_WAITING);
+        let queries_at_once = limits.queries_at_once;
         let counter = Counter {
             responder,
-            answers: Arc::new(Semaphore::new(ANSWERS_AT_ONCE)),
+            answers: Arc::new(Semaphore::new(queries_at_once)),
             turns: Arc::new(Semaphore::new(TURNS)),
             commands: Arc::new(Semaphore::new(COMMANDS_AT_ONCE)),
             refused,
+            rate: Arc::new(Rate::new(limits.commands_per_second)),
+            limits: Arc::new(limits),
             runtime: Handle::current(),
         };
         let mut declared = Vec::new();
@@ -94,13 +100,13 @@ impl Queryables {
         if let Some(key) = node.service(topic.name(), GET_MAP)? {
             declared.push(counter.declare(session, topic, key, Asker::RosNode).await?);
         }
-        let refusals = tokio::spawn(refuse_all(waiting));
-        Ok(Self { declared, counter, refusals })
+        let refusals = tokio::spawn(refuse_all(waiting, queries_at_once));
+        Ok(Self { declared, counter, queries_at_once: queries_at_once as u32, refusals })
     }
 
     /// Takes no more queries, and waits until those that came are answered.
     pub(super) async fn stop(self) {
-        let Self { declared, counter, refusals } = self;
+        let Self { declared, counter, queries_at_once, refusals } = self;
         // It blocks while the network is slow.
         let undeclare = move || {
             for queryable in declared {
@@ -110,7 +116,7 @@ impl Queryables {
             }
         };
         spawn_blocking(undeclare).await.ok();
-        counter.answers.acquire_many(ANSWERS_AT_ONCE as u32).await.ok();
+        counter.answers.acquire_many(queries_at_once).await.ok();
         counter.commands.acquire_many(COMMANDS_AT_ONCE as u32).await.ok();
         refusals.abort();
     }
@@ -138,7 +144,7 @@ impl Counter {
         if let Some(payload) = query.payload_mut() {
             *payload = ZBytes::new();
         }
-        let places = if topic.is_command() { &self.commands } else { &self.answers };
+        let places = if topic.command().is_some() { &self.commands } else { &self.answers };
         let Ok(place) = places.clone().try_acquire_owned() else {
             let may_wait = query.parameters().as_str().len() <= LONGEST_WAITING;
             if !may_wait || self.refused.try_send(query).is_err() {
@@ -146,9 +152,9 @@ impl Counter {
             }
             return;
         };
-        let responder = self.responder.clone();
+        let counter = self.clone();
         let answering = move || {
-            let answer = answer(&responder, topic, &query);
+            let answer = counter.answer(topic, &query);
             let answer = answer.map(|answer| asker.sign(answer, &query));
             reply(&query, &key, answer);
             // Whoever asked is told that nothing more comes before the place is free again.
@@ -160,6 +166,29 @@ impl Counter {
         } else {
             self.runtime.spawn_blocking(answering);
         }
+    }
+
+    fn answer(&self, topic: Topic, query: &Query) -> Result<Answer, Refusal> {
+        let limits = &self.limits;
+        if let Some(command) = topic.command() {
+            if query.key_expr().is_wild() {
+                return Err(Refusal::Wildcard(topic.name()));
+            }
+            if !limits.commands.contains(&command) {
+                tracing::warn!(command = topic.name(), "refused a command that is switched off");
+                return Err(Refusal::SwitchedOff(topic.name()));
+            }
+        }
+        let question = topic.question(query.parameters().as_str())?;
+        if topic.command().is_some() && !self.rate.admits(clock::now()) {
+            return Err(Refusal::TooManyCommands(limits.commands_per_second));
+        }
+        let answer = self.responder.answer(&question)?;
+        let bytes = answer.payloads.iter().map(Bytes::len).sum();
+        if bytes > limits.max_reply_bytes {
+            return Err(Refusal::TooLarge { bytes, most: limits.max_reply_bytes });
+        }
+        Ok(answer)
     }
 }
 
@@ -184,13 +213,6 @@ impl Asker {
     }
 }
 
-fn answer(responder: &Responder, topic: Topic, query: &Query) -> Result<Answer, Refusal> {
-    if topic.is_command() && query.key_expr().is_wild() {
-        return Err(Refusal::Wildcard(topic.name().to_owned()));
-    }
-    responder.answer(&topic.question(query.parameters().as_str())?)
-}
-
 /// Blocks until the transport has taken the reply.
 fn reply(query: &Query, key: &OwnedKeyExpr, answer: Result<Answer, Refusal>) {
     let sent = match answer {
@@ -207,10 +229,10 @@ fn reply(query: &Query, key: &OwnedKeyExpr, answer: Result<Answer, Refusal>) {
 }
 
 /// One after the other, so that clients that do not read cost one thread.
-async fn refuse_all(mut waiting: mpsc::Receiver<Query>) {
+async fn refuse_all(mut waiting: mpsc::Receiver<Query>, queries_at_once: usize) {
     while let Some(query) = waiting.recv().await {
         let refuse = move || {
-            let refusal = Refusal::TooMany(ANSWERS_AT_ONCE).to_string();
+            let refusal = Refusal::TooMany(queries_at_once).to_string();
             query.reply_err(refusal).encoding(Encoding::TEXT_PLAIN).wait().ok();
         };
         spawn_blocking(refuse).await.ok();

@@ -10,6 +10,7 @@ use thiserror::Error;
 
 use super::save::{NameError, SaveName};
 use super::tiles::TilesQuestion;
+use crate::config::CommandName;
 use crate::map::region::{Layer, Window};
 use crate::map::tiles::TileIndex;
 use crate::slam::pose::{Point2, Pose2, Stamp, wrap_angle};
@@ -107,10 +108,25 @@ impl Topic {
         }
     }
 
-    /// Whether asking changes something, so that it must not happen by a wildcard.
+    /// What asking changes, if it does; then it must not happen by a wildcard.
     #[must_use]
-    pub const fn is_command(self) -> bool {
-        matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::InitialPose | Self::Save)
+    pub const fn command(self) -> Option<CommandName> {
+        match self {
+            Self::Reset => Some(CommandName::Reset),
+            Self::Pause => Some(CommandName::Pause),
+            Self::Resume => Some(CommandName::Resume),
+            Self::InitialPose => Some(CommandName::InitialPose),
+            Self::Save => Some(CommandName::Save),
+            Self::Map
+            | Self::DynamicMap
+            | Self::MapMetadata
+            | Self::Pose
+            | Self::Path
+            | Self::ParticleCloud
+            | Self::Entropy
+            | Self::Tiles
+            | Self::Status => None,
+        }
     }
 
     /// Whether the answer may be megabytes, which take their time on the network.

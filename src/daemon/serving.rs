@@ -17,6 +17,7 @@ use super::command::Request;
 use super::formats::ProductCache;
 use super::keys::KeyError;
 use super::ledger::Entry;
+use super::limits::Limits;
 use super::outputs;
 use super::queries::Queryables;
 use super::ros_node::RosNode;
@@ -51,6 +52,8 @@ pub struct Settings {
     pub tf_delay_s: f64,
     /// Where `slam/cmd/save` writes; it is made when it is needed.
     pub save_directory: PathBuf,
+    /// What is refused.
+    pub limits: Limits,
 }
 
 impl Settings {
@@ -71,6 +74,7 @@ impl Settings {
             },
             tf_delay_s: raw.tf_delay.unwrap_or(raw.transform_publish_period),
             save_directory,
+            limits: Limits::new(config),
         }
     }
 }
@@ -170,7 +174,8 @@ impl Serving {
         let products = responder.products();
         declare.map_updates(&settings, &snapshots, products, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
-        let queryables = Queryables::declare(session, &mut node, responder).await?;
+        let limits = settings.limits.clone();
+        let queryables = Queryables::declare(session, &mut node, responder, limits).await?;
         let announced = node.announce(session).await?;
         let key = node.prefix().key(ALIVE)?;
         let alive = session.liveliness().declare_token(key.clone()).await;

@@ -11,11 +11,13 @@ use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
 use super::keys::InputKeys;
 use super::ledger::Verdict;
+use super::links::{Links, LinksStatus};
 use super::mailbox::Mailbox;
 use super::mapper::Gauges;
 use super::snapshot::{MapVersion, Snapshot, State};
 use super::synchronizer::Channel;
 use crate::clock;
+use crate::config::{EngineKind, RawConfig};
 use crate::slam::pose::Pose2;
 use crate::slam::scan::LaserMount;
 use crate::slam::update::WeakDirection;
@@ -27,8 +29,12 @@ use crate::timeline::TimelineCounts;
 pub struct Status {
     /// Of gmapd.
     pub version: &'static str,
+    /// What maps.
+    pub engine: EngineKind,
     /// Seconds since the daemon started.
     pub uptime_s: f64,
+    /// The session's links.
+    pub links: LinksStatus,
     /// In one word.
     pub state: State,
     /// In a sentence, with what to do where something is wrong.
@@ -123,11 +129,13 @@ pub struct MapStatus {
 pub struct StatusSource {
     started: Instant,
     keys: InputKeys,
+    engine: EngineKind,
     seed: u64,
     inbox: Arc<Inbox>,
     mailbox: Arc<Mailbox>,
     gauges: Arc<Mutex<Gauges>>,
     snapshots: watch::Receiver<Arc<Snapshot>>,
+    links: Arc<Links>,
     /// Of the version of the map that was asked for last.
     map: Mutex<Option<MapStatus>>,
 }
@@ -139,13 +147,15 @@ pub(super) struct Shared {
     pub(super) mailbox: Arc<Mailbox>,
     pub(super) gauges: Arc<Mutex<Gauges>>,
     pub(super) snapshots: watch::Receiver<Arc<Snapshot>>,
+    pub(super) links: Arc<Links>,
 }
 
 impl StatusSource {
-    pub(super) fn new(keys: InputKeys, seed: u64, shared: Shared) -> Self {
-        let Shared { inbox, mailbox, gauges, snapshots } = shared;
+    pub(super) fn new(keys: InputKeys, config: &RawConfig, shared: Shared) -> Self {
+        let Shared { inbox, mailbox, gauges, snapshots, links } = shared;
+        let &RawConfig { engine, seed, .. } = config;
         let (started, map) = (clock::now(), Mutex::default());
-        Self { started, keys, seed, inbox, mailbox, gauges, snapshots, map }
+        Self { started, keys, engine, seed, inbox, mailbox, gauges, snapshots, links, map }
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -198,6 +208,8 @@ impl StatusSource {
             filter: filter_status(&snapshot, &gauges),
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
             peak_memory_bytes: clock::peak_resident_memory(),
+            engine: self.engine,
+            links: self.links.status(),
             seed: self.seed,
         }
     }

@@ -3,6 +3,7 @@
 use super::finding::Finding;
 use super::motion::{self, Agreement};
 use super::watch::{Counts, Input, SeenPose, SeenScan, Watch};
+use crate::config::EngineKind;
 use crate::convert;
 use crate::slam::pose::Stamp;
 use crate::slam::scan::{Beam, LaserMount};
@@ -68,12 +69,19 @@ impl Report {
         if received(Input::Scan) == 0 {
             self.findings.push(Finding::NothingArrives { key: watch.key(Input::Scan) });
         }
-        if received(Input::Odom) == 0 && watch.tf_odometry.is_empty() {
-            self.findings.push(Finding::NoOdometry {
+        let without = received(Input::Odom) == 0 && watch.tf_odometry.is_empty();
+        let engine = watch.status.as_ref().and_then(|status| status.engine);
+        match engine.unwrap_or(EngineKind::Gmapping) {
+            EngineKind::Hector if without => {
+                self.facts.push("odometry: none; Hector maps from scans alone".to_owned());
+            }
+            EngineKind::Gmapping if without => self.findings.push(Finding::NoOdometry {
                 key: watch.key(Input::Odom),
                 odom: watch.names.odom.clone(),
                 base: watch.names.base.clone(),
-            });
+            }),
+            // What known_poses lacks the daemon tells itself.
+            EngineKind::Gmapping | EngineKind::Hector | EngineKind::KnownPoses => {}
         }
         for input in Input::ALL {
             let Counts { received, rejected, reason } = &watch.inputs[input as usize];

@@ -195,6 +195,27 @@ fn silence_is_three_findings() {
     );
 }
 
+#[test]
+fn only_gmapping_needs_odometry() {
+    let scans_alone = |status: &str| {
+        let names = FrameNames { odom: "odom".to_owned(), base: "base_link".to_owned() };
+        let mut watch = Watch::new(keys(), names);
+        for reading in drive(MountOrientation::Upright) {
+            let scan = convert::laser_scan(&reading.scan, "base_link");
+            watch.add(Input::Scan, reading.stamp, (&ros::cdr(&scan), ""));
+        }
+        watch.add_status(status.as_bytes());
+        watch.report()
+    };
+    let report = scans_alone(r#"{"state":"mapping","detail":"","engine":"hector"}"#);
+    assert_eq!(report.findings, []);
+    assert!(report.facts.join("\n").contains("Hector maps from scans alone"));
+    let report = scans_alone(r#"{"state":"mapping","detail":"","engine":"known_poses"}"#);
+    assert_eq!(report.findings, []);
+    let report = scans_alone(r#"{"state":"mapping","detail":"","engine":"gmapping"}"#);
+    assert!(matches!(report.findings[..], [Finding::NoOdometry { .. }]), "{:?}", report.findings);
+}
+
 /// A robot without odometry messages, whose transforms tell the same.
 #[test]
 fn odometry_from_transforms_is_odometry() {

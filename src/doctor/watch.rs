@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
+use crate::config::EngineKind;
 use crate::convert;
 use crate::ros;
 use crate::slam::pose::{Pose2, Stamp};
@@ -112,6 +113,8 @@ pub(super) struct SeenPose {
 pub(super) struct DaemonStatus {
     pub(super) state: String,
     pub(super) detail: String,
+    /// Left out by older daemons.
+    pub(super) engine: Option<EngineKind>,
     #[serde(default)]
     pub(super) scans: std::collections::BTreeMap<String, u64>,
 }

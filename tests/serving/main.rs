@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use gmapd::config::CommandName;
 use gmapd::daemon::command::{Command, Done};
 use gmapd::daemon::ledger::{Entry, Verdict};
 use gmapd::daemon::snapshot::{MapVersion, Snapshot};
@@ -11,6 +12,7 @@ use gmapd::ros;
 use gmapd::slam::grid::occupancy::{OccupancyGrid, OccupiedThreshold};
 use gmapd::slam::pose::{Pose2, Stamp};
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
+use tokio::task::JoinSet;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
@@ -444,7 +446,9 @@ async fn maps_keep_their_distance_and_who_comes_anew_does_not_wait() {
     let daemon = open("peer", None).await;
     let client = open("peer", Some(&locator(&daemon).await)).await;
     let hour = Duration::from_secs(3600);
-    let rig = Rig::with_interval(daemon, client, drive[3].clone(), hour).await;
+    let rig =
+        Rig::with(daemon, client, drive[3].clone(), |settings| settings.map_update_interval = hour)
+            .await;
     let mut poses = rig.subscribe("pose").await;
     let (first, mut maps) = late_joiner(&rig.client, "map").await;
     until_map_of(&mut maps, &drive[3]).await;
@@ -597,6 +601,36 @@ async fn of_many_queries_at_once_each_gets_one_reply() {
     }
     assert!(answered >= 64, "{answered}");
     assert!(replies.recv().await.is_none(), "one reply each");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn commands_that_are_switched_off_or_too_many_and_answers_too_large_are_refused() {
+    let daemon = open("peer", None).await;
+    let client = open("peer", Some(&locator(&daemon).await)).await;
+    let rig = Rig::with(daemon, client, last(), |settings| {
+        settings.limits.commands = vec![CommandName::Save];
+        settings.limits.commands_per_second = 2;
+        settings.limits.max_reply_bytes = 1000;
+    });
+    let rig = rig.await;
+    let refused = rig.ask("slam/cmd/reset").await.unwrap_err();
+    assert!(refused.starts_with("slam/cmd/reset is switched off on this robot"), "{refused}");
+    let refused = rig.ask("map").await.unwrap_err();
+    assert!(refused.contains("max_reply_bytes allows 1000; ask for a part"), "{refused}");
+    assert!(rig.ask("map?bbox=-0.5,-0.5,0.5,0.5").await.is_ok());
+
+    let mut saves = JoinSet::new();
+    for _ in 0..6 {
+        let client = rig.client.clone();
+        saves.spawn(async move { ask(&client, "slam/cmd/save").await });
+    }
+    let (done, refused): (Vec<_>, Vec<_>) =
+        saves.join_all().await.into_iter().partition(Result::is_ok);
+    assert!(done.len() >= 2 && !refused.is_empty(), "{} were done at once", done.len());
+    for error in refused {
+        let error = error.unwrap_err();
+        assert_eq!(error, "2 commands were given in this second already; ask again");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

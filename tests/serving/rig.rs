@@ -5,9 +5,12 @@ use std::fmt::Debug;
 use std::sync::Arc;
 use std::time::Duration;
 
+use gmapd::config::{Config, EngineKind};
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::ledger::{Entry, Ledger};
+use gmapd::daemon::limits::Limits;
+use gmapd::daemon::links::LinksStatus;
 use gmapd::daemon::ros_node::{Convention, RosNode};
 use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
 use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
@@ -106,6 +109,8 @@ pub(crate) fn nothing() -> Snapshot {
 fn status() -> Status {
     Status {
         version: "1.2.3",
+        engine: EngineKind::Gmapping,
+        links: LinksStatus::default(),
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
         detail: "odometry is missing".to_owned(),
@@ -146,30 +151,32 @@ impl Rig {
 
     /// Serves on one session, and waits until the other knows.
     pub(crate) async fn between(daemon: Session, client: Session, first: Snapshot) -> Self {
-        Self::with_interval(daemon, client, first, Duration::ZERO).await
+        Self::with(daemon, client, first, |_| ()).await
     }
 
-    /// With a time between two maps.
-    pub(crate) async fn with_interval(
+    /// With other settings.
+    pub(crate) async fn with(
         daemon: Session,
         client: Session,
         first: Snapshot,
-        map_update_interval: Duration,
+        change: impl FnOnce(&mut Settings),
     ) -> Self {
         let directory = tempfile::tempdir().expect("there is a place for temporary files");
         let (snapshots, watched) = watch::channel(Arc::new(first));
         let (verdicts, heard) = broadcast::channel(16);
         let (commander, commands) = mpsc::channel(16);
-        let settings = Settings {
+        let mut settings = Settings {
             map_frame: "map".to_owned(),
             odom_frame: "odom".to_owned(),
             base_frame: "base_link".to_owned(),
             resolution: 0.05,
-            map_update_interval,
+            map_update_interval: Duration::ZERO,
             transform_publish_period: Duration::from_millis(20),
             tf_delay_s: 0.02,
             save_directory: directory.path().join("maps"),
+            limits: Limits::new(&Config::load(None, &[]).expect("the defaults are allowed")),
         };
+        change(&mut settings);
         let sources = Sources {
             snapshots: watched,
             verdicts: heard,

@@ -1,0 +1,221 @@
+//! Strangers on the mesh: the ready configurations keep them out, and the daemon's own limits
+//! hold against those who are in.
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use gmapd::config::Config;
+use gmapd::daemon::keys::Prefix;
+use gmapd::daemon::snapshot::State;
+use gmapd::daemon::{Daemon, Settings};
+use tokio::sync::watch;
+use tracing_subscriber::EnvFilter;
+use zenoh::query::Query;
+use zenoh::{Session, Wait as _};
+
+/// How long anything may take on a machine that does other things as well.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What all sessions of this process log.
+#[derive(Debug, Clone)]
+struct Log(Arc<watch::Sender<String>>);
+
+impl Log {
+    fn start() -> Self {
+        static LOG: OnceLock<Log> = OnceLock::new();
+        let log = LOG.get_or_init(|| {
+            let log = Self(Arc::new(watch::Sender::default()));
+            let writer = log.clone();
+            // As `docs/security.md` says.
+            let denials = "warn,zenoh_transport::unicast::establishment::accept=debug,\
+                           zenoh::net::routing::interceptor=trace";
+            tracing_subscriber::fmt()
+                .with_env_filter(EnvFilter::new(denials))
+                .with_ansi(false)
+                .with_writer(move || writer.clone())
+                .init();
+            log
+        });
+        log.clone()
+    }
+
+    /// Waits for a line with all of these.
+    async fn says(&self, words: &[&str]) {
+        let mut text = self.0.subscribe();
+        let said =
+            |text: &String| text.lines().any(|line| words.iter().all(|word| line.contains(word)));
+        let waited = tokio::time::timeout(PATIENCE, text.wait_for(said)).await.map(drop);
+        assert!(waited.is_ok(), "{words:?} is not in\n{}", self.0.borrow().as_str());
+    }
+}
+
+impl io::Write for Log {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.send_modify(|text| text.push_str(&String::from_utf8_lossy(bytes)));
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// A copy of the ready configurations, with certificates.
+struct Mesh {
+    log: Log,
+    directory: tempfile::TempDir,
+    /// Which of the configurations.
+    kind: &'static str,
+    router: Session,
+    locator: String,
+}
+
+fn secure() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/secure")
+}
+
+fn make_certificates(directory: &Path, names: &[&str]) {
+    let script = secure().join("certificates.sh");
+    let output = Command::new(script).arg(directory).args(names).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+impl Mesh {
+    /// The router of `config/secure` or a folder in it, on a port of the loopback.
+    async fn start(kind: &'static str) -> Self {
+        let log = Log::start();
+        let directory = tempfile::tempdir().unwrap();
+        let names = ["router", "robot01", "base", "reader"];
+        make_certificates(&directory.path().join("certificates"), &names);
+        make_certificates(&directory.path().join("strangers"), &["robot01"]);
+        let users = secure().join("password/users.txt");
+        std::fs::copy(users, directory.path().join("users.txt")).unwrap();
+        let text = configuration(directory.path(), kind, "router.json5");
+        let text = text.replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
+        let router = zenoh::open(zenoh::Config::from_json5(&text).unwrap()).await.unwrap();
+        let port = router.info().locators().await[0].to_string();
+        let port = port.rsplit(':').next().unwrap().to_owned();
+        Self { log, directory, kind, router, locator: format!("tls/localhost:{port}") }
+    }
+
+    /// How `who` connects; a stranger is refused at once.
+    fn configuration(&self, who: &str) -> String {
+        configuration(self.directory.path(), self.kind, &format!("{who}.json5"))
+            .replace("tls/localhost:7447", &self.locator)
+            .replace("timeout_ms: -1", "timeout_ms: 0")
+    }
+
+    async fn open(&self, who: &str) -> Session {
+        let config = zenoh::Config::from_json5(&self.configuration(who)).unwrap();
+        zenoh::open(config).await.unwrap()
+    }
+
+    async fn refuses(&self, configuration: &str) {
+        let config = zenoh::Config::from_json5(configuration).unwrap();
+        let opened = tokio::time::timeout(PATIENCE, zenoh::open(config)).await.unwrap();
+        assert!(opened.is_err(), "let in with {configuration}");
+    }
+
+    /// What holds for everybody who is in, with certificates or passwords.
+    async fn keeps_each_to_what_is_theirs(&self) {
+        let robot = self.open("robot").await;
+        let daemon = Daemon::start(&robot, settings(&[])).await.unwrap();
+        let [base, reader] = [self.open("base").await, self.open("reader").await];
+        assert_eq!(ask(&reader, "robot01/slam/status").await.len(), 1);
+        assert_eq!(ask(&reader, "*/slam/status").await.len(), 1);
+
+        assert!(ask(&reader, "robot01/slam/cmd/pause").await.is_empty());
+        let wildcard = ask(&reader, "robot01/slam/*/pause").await;
+        assert!(wildcard[0].contains("wildcard"), "{wildcard:?}");
+        assert_eq!(daemon.status().state, State::WaitingForScans);
+        self.log.says(&["(reader)", "unauthorized to Query (ingress) on robot01/slam/cmd"]).await;
+
+        for stranger in [&reader, &base] {
+            stranger.put("robot01/scan", "no scan").await.unwrap();
+            // What was sent on this link before has been dealt with when this is answered.
+            assert_eq!(ask(stranger, "robot01/slam/status").await.len(), 1);
+        }
+        assert_eq!(daemon.status().inputs["scan"].received, 0);
+        self.log.says(&["(reader)", "unauthorized to Put (ingress) on robot01/scan"]).await;
+        self.log.says(&["(base)", "unauthorized to Put (ingress) on robot01/scan"]).await;
+
+        let lie = |query: Query| query.reply(query.key_expr(), "a lie").wait().unwrap();
+        let impostor = reader.declare_queryable("robot01/map").callback(lie).await.unwrap();
+        assert_eq!(ask(&reader, "robot01/slam/status").await.len(), 1);
+        let maps = ask(&base, "robot01/map?format=json").await;
+        assert!(maps.len() == 1 && maps[0].contains("resolution"), "{maps:?}");
+        impostor.undeclare().await.unwrap();
+
+        let paused = ask(&base, "robot01/slam/cmd/pause").await;
+        assert!(paused[0].contains("mapping is paused"), "{paused:?}");
+        let mut verdicts = daemon.verdicts();
+        let laser = self.open("robot").await;
+        laser.put("robot01/scan", "no scan").await.unwrap();
+        tokio::time::timeout(PATIENCE, verdicts.recv()).await.unwrap().unwrap();
+        assert_eq!(daemon.status().inputs["scan"].received, 1);
+
+        daemon.stop().await;
+        for session in [robot, base, reader, laser, self.router.clone()] {
+            session.close().await.unwrap();
+        }
+    }
+}
+
+/// One of the ready configurations, with whole paths.
+fn configuration(directory: &Path, kind: &str, name: &str) -> String {
+    let text = std::fs::read_to_string(secure().join(kind).join(name)).unwrap();
+    let within = |name: &str| format!("\"{}/{name}", directory.display());
+    text.replace("\"certificates/", &within("certificates/"))
+        .replace("\"users.txt", &within("users.txt"))
+}
+
+fn settings(set: &[&str]) -> Settings {
+    let set: Vec<String> = set.iter().map(|&text| text.to_owned()).collect();
+    let config = Config::load(None, &set).unwrap();
+    Settings { config, prefix: Prefix::parse("robot01").unwrap(), threads: 1 }
+}
+
+/// The text of each reply.
+async fn ask(session: &Session, selector: &str) -> Vec<String> {
+    let replies = session.get(selector).timeout(PATIENCE).await.unwrap();
+    let mut texts = Vec::new();
+    while let Ok(reply) = replies.recv_async().await {
+        let payload = match reply.result() {
+            Ok(sample) => sample.payload(),
+            Err(error) => error.payload(),
+        };
+        texts.push(payload.try_to_string().unwrap().into_owned());
+    }
+    texts
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_certificates_each_does_what_is_theirs_and_strangers_stay_outside() {
+    let mesh = Mesh::start("").await;
+    let robot = mesh.configuration("robot");
+    let without = robot.replace("connect_certificate", "//").replace("connect_private_key", "//");
+    mesh.refuses(&without.replace("enable_mtls: true", "enable_mtls: false")).await;
+    mesh.log.says(&["peer sent no certificates"]).await;
+    mesh.refuses(&robot.replace("certificates/robot01", "strangers/robot01")).await;
+    mesh.log.says(&["invalid peer certificate"]).await;
+    // A router that is signed by somebody else is not believed either.
+    mesh.refuses(&robot.replace("certificates/authority", "strangers/authority")).await;
+    mesh.keeps_each_to_what_is_theirs().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_passwords_each_does_what_is_theirs_and_strangers_stay_outside() {
+    let mesh = Mesh::start("password").await;
+    let robot = mesh.configuration("robot");
+    mesh.refuses(&robot.replace("CHANGE-robot01", "guess")).await;
+    mesh.log.says(&["accept", "Invalid password"]).await;
+    mesh.refuses(&robot.replace("user: \"robot01\"", "user: \"robot02\"")).await;
+    mesh.log.says(&["accept", "Invalid user"]).await;
+    mesh.refuses(&robot.replace("auth:", "//")).await;
+    mesh.log.says(&["accept", "Expected extension"]).await;
+    mesh.keeps_each_to_what_is_theirs().await;
+}
