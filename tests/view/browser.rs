@@ -45,20 +45,20 @@ impl Browser {
     /// A page of the size of a screen.
     pub(crate) fn open(mut self, url: &str) -> Page {
         let blank = json!({ "url": "about:blank" });
-        let target = self.call("", "Target.createTarget", blank)["targetId"].take();
+        let target = self.call("", "Target.createTarget", &blank)["targetId"].take();
         let attach = json!({ "targetId": target, "flatten": true });
-        let session = self.call("", "Target.attachToTarget", attach)["sessionId"].take();
+        let session = self.call("", "Target.attachToTarget", &attach)["sessionId"].take();
         let session = session.as_str().expect("sessions have names").to_owned();
         let mut page = Page { browser: self, session };
         for domain in ["Runtime", "Log", "Page"] {
-            page.call(&format!("{domain}.enable"), json!({}));
+            page.call(&format!("{domain}.enable"), &json!({}));
         }
         page.size((1280, 800), 1);
-        page.call("Page.navigate", json!({ "url": url }));
+        page.call("Page.navigate", &json!({ "url": url }));
         page
     }
 
-    fn call(&mut self, session: &str, method: &str, parameters: Value) -> Value {
+    fn call(&mut self, session: &str, method: &str, parameters: &Value) -> Value {
         self.calls += 1;
         let mut call = json!({ "id": self.calls, "method": method, "params": parameters });
         if !session.is_empty() {
@@ -107,7 +107,7 @@ pub(crate) struct Page {
 }
 
 impl Page {
-    fn call(&mut self, method: &str, parameters: Value) -> Value {
+    fn call(&mut self, method: &str, parameters: &Value) -> Value {
         self.browser.call(&self.session, method, parameters)
     }
 
@@ -115,14 +115,14 @@ impl Page {
         let size = json!({
             "width": width, "height": height, "deviceScaleFactor": scale, "mobile": scale > 1,
         });
-        self.call("Emulation.setDeviceMetricsOverride", size);
+        self.call("Emulation.setDeviceMetricsOverride", &size);
     }
 
     /// The page on a phone in the dark.
     pub(crate) fn phone(&mut self) {
         self.size((390, 844), 2);
         let dark = json!({ "name": "prefers-color-scheme", "value": "dark" });
-        self.call("Emulation.setEmulatedMedia", json!({ "features": [dark] }));
+        self.call("Emulation.setEmulatedMedia", &json!({ "features": [dark] }));
     }
 
     /// Waits until an expression is true, and returns what it is.
@@ -137,7 +137,7 @@ impl Page {
             }})"
         );
         let wait = json!({ "expression": wait, "awaitPromise": true, "returnByValue": true });
-        let answer = self.call("Runtime.evaluate", wait);
+        let answer = self.call("Runtime.evaluate", &wait);
         assert_eq!(answer["exceptionDetails"], Value::Null, "{expression}");
         answer["result"]["value"].clone()
     }
@@ -152,14 +152,14 @@ impl Page {
             "type": format!("mouse{what:?}"), "x": x, "y": y, "button": button,
             "buttons": buttons, "clickCount": 1,
         });
-        self.call("Input.dispatchMouseEvent", event);
+        self.call("Input.dispatchMouseEvent", &event);
     }
 
     /// Keeps a picture of the page, to be looked at.
     pub(crate) fn screenshot(&mut self, name: &str) {
         let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("view");
         fs::create_dir_all(&folder).expect("the target folder takes folders");
-        let picture = self.call("Page.captureScreenshot", json!({}));
+        let picture = self.call("Page.captureScreenshot", &json!({}));
         let picture = decoded(picture["data"].as_str().expect("a picture is text"));
         assert!(picture.starts_with(b"\x89PNG"), "{name}");
         fs::write(folder.join(format!("{name}.png")), picture).expect("it takes files");

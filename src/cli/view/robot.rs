@@ -65,7 +65,7 @@ impl Watched {
             robot: robot.clone(),
             scene: sender.clone(),
             laser,
-            processed: Value::Null,
+            particles: Value::Null,
             path: PathAsked::default(),
         };
         tasks.spawn(asker.run());
@@ -97,15 +97,15 @@ struct Asker {
     robot: Prefix,
     scene: watch::Sender<Scene>,
     laser: watch::Sender<Option<Laser>>,
-    /// How many scans were processed when the particles were asked for.
-    processed: Value,
+    /// Processed scans and pose when the particles were asked for.
+    particles: Value,
     path: PathAsked,
 }
 
 /// When the path was asked for last.
 #[derive(Default)]
 struct PathAsked {
-    /// Scans, epoch and such in the map then.
+    /// Scans in the map and its version then.
     map: Value,
     /// Statuses since then.
     statuses: usize,
@@ -132,9 +132,9 @@ impl Asker {
         }
         let laser = laser_of(&status);
         self.laser.send_if_modified(|old| std::mem::replace(old, laser.clone()) != laser);
-        let processed = &status["scans"]["processed"];
-        if *processed != self.processed {
-            self.processed = processed.clone();
+        let particles = json!([status["scans"]["processed"], status["pose_in_map"]]);
+        if particles != self.particles {
+            self.particles = particles;
             self.ask_particles().await;
         }
         self.path.statuses += 1;

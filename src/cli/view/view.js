@@ -9,7 +9,9 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 let robot = parameters.get("robot");
 let socket, robots = [], tool = null, drag = null;
 // What is known of the robot.
-let scene = {}, trail = [], tiles = new Map(), arriving = new Map(), head = null;
+let scene = {}, trail = [], tiles = new Map(), head = null;
+// Tiles of a version that is not whole yet, and whether it has none of those before.
+let arriving = new Map(), isAnew = false;
 // Metres at the middle of the canvas, CSS pixels a metre.
 const eye = { x: 0, y: 0, scale: 20, fits: true };
 const shown = { scan: true, path: true, particles: true };
@@ -40,7 +42,8 @@ function connect() {
 }
 
 function forget() {
-  [scene, trail, tiles, arriving, head] = [{}, [], new Map(), new Map(), null];
+  [scene, trail, tiles, head] = [{}, [], new Map(), null];
+  [arriving, isAnew] = [new Map(), false];
 }
 
 function choose(name) {
@@ -60,17 +63,23 @@ async function take(data) {
     await takeTiles(data);
   } else {
     const news = JSON.parse(data);
-    if (news.clear) arriving.clear();
-    if (news.clear) arriving.isAnew = true;
+    if (news.clear) [arriving, isAnew] = [new Map(), true];
     if (news.robots) takeRobots(news.robots);
     if (news.path) trail = [];
-    if (news.pose && scene.path) trail.push(news.pose.x, news.pose.y);
+    if (news.pose && scene.path) follow(news.pose);
     // Who does not answer is shown as it was.
     if (news.status === null) delete news.status;
     Object.assign(scene, news);
     if (news.status) showStatus(news.status);
   }
   requestDraw();
+}
+
+// The way since the path was told. A pose that was set does not continue it.
+function follow({ x, y }) {
+  const last = trail.slice(-2);
+  if (last.length && distance(last, [x, y]) > 1) trail = [];
+  trail.push(x, y);
 }
 
 function takeRobots(news) {
@@ -98,8 +107,8 @@ async function takeTiles(buffer) {
     at += 26 + length;
   }
   if (u16(4) + 1 < u16(6)) return;
-  tiles = arriving.isAnew ? arriving : new Map([...tiles, ...arriving]);
-  arriving = new Map();
+  tiles = isAnew ? arriving : new Map([...tiles, ...arriving]);
+  [arriving, isAnew] = [new Map(), false];
   head = { resolution: view.getFloat64(40, true), side };
   if (eye.fits) fit();
 }
@@ -222,7 +231,8 @@ function draw() {
   context.scale(devicePixelRatio, devicePixelRatio);
   const style = getComputedStyle(document.documentElement);
   const colour = (name) => style.getPropertyValue(`--${name}`);
-  if (shown.path) drawLine([...scene.path ?? [], ...trail], colour("path"), 2);
+  if (shown.path) drawLine(scene.path ?? [], colour("path"), 2);
+  if (shown.path) drawLine(trail, colour("path"), 2);
   const isLive = isAlive() && !["paused", "waiting_for_scans"].includes(scene.status?.state);
   if (shown.scan && isLive) drawDots(scene.scan ?? [], colour("scan"), 2.5);
   if (shown.particles) drawDots(scene.particles ?? [], colour("particles"), 2);
