@@ -65,7 +65,7 @@ async function take(data) {
     const news = JSON.parse(data);
     if (news.clear) [arriving, isAnew] = [new Map(), true];
     if (news.robots) takeRobots(news.robots);
-    if (news.path) trail = [];
+    if (news.path) trail = news.path.slice(-2);
     if (news.pose && scene.path) follow(news.pose);
     // Who does not answer is shown as it was.
     if (news.status === null) delete news.status;
