@@ -1,61 +1,17 @@
 //! Drives the real program over real Zenoh on loopback: a daemon, and those who ask it.
 
 use std::fs;
-use std::io::{BufRead as _, BufReader, Read};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
-use std::sync::mpsc::{Receiver, channel};
-use std::thread;
-use std::time::Duration;
 
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
-/// Much longer than anything takes, for machines with other things to do.
-const PATIENCE: Duration = Duration::from_secs(60);
+use self::processes::{Background, Daemon, ROUTER, directory, endpoint, file, gmapd, program};
+use self::processes::{simulated_log, succeed, text};
 
-/// A router, so that everybody on loopback hears everybody, and nobody else does.
-const ROUTER: &str = r#"{
-    mode: "router",
-    listen: { endpoints: ["tcp/127.0.0.1:0"] },
-    scouting: { multicast: { enabled: false }, gossip: { enabled: false } },
-}"#;
-
-fn program() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gmapd"));
-    command.stdin(Stdio::null()).env_remove("COLUMNS");
-    command
-}
-
-/// A finished run of the program.
-struct Run {
-    code: Option<i32>,
-    stdout: Vec<u8>,
-    stderr: String,
-}
-
-impl Run {
-    fn of(output: Output) -> Self {
-        let stderr = String::from_utf8(output.stderr).expect("it prints text");
-        Self { code: output.status.code(), stdout: output.stdout, stderr }
-    }
-
-    fn text(&self) -> &str {
-        std::str::from_utf8(&self.stdout).expect("it prints text")
-    }
-}
-
-fn gmapd(arguments: &[&str]) -> Run {
-    Run::of(program().args(arguments).output().expect("the program was built with this test"))
-}
-
-/// What it printed; it has to succeed.
-fn succeed(arguments: &[&str]) -> String {
-    let run = gmapd(arguments);
-    assert_eq!(run.code, Some(0), "{arguments:?}: {}{}", run.text(), run.stderr);
-    run.text().to_owned()
-}
+#[expect(dead_code, reason = "other tests use the rest")]
+mod processes;
 
 /// What it complained about.
 fn fail(arguments: &[&str], code: i32) -> String {
@@ -64,94 +20,7 @@ fn fail(arguments: &[&str], code: i32) -> String {
     run.stderr
 }
 
-/// A program that runs until the test ends.
-struct Background {
-    child: Child,
-    lines: Receiver<String>,
-}
-
-impl Background {
-    /// Its standard error and output are read all the time, or it would block.
-    fn start(command: &mut Command) -> Self {
-        let mut child = command
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("the program was built with this test");
-        let (sender, lines) = channel();
-        let out: Box<dyn Read + Send> = Box::new(child.stdout.take().expect("it is piped"));
-        let err: Box<dyn Read + Send> = Box::new(child.stderr.take().expect("it is piped"));
-        for stream in [out, err] {
-            let sender = sender.clone();
-            let read = move || {
-                for line in BufReader::new(stream).lines().map_while(Result::ok) {
-                    sender.send(line).ok();
-                }
-            };
-            let thread = thread::Builder::new().name("output".to_owned());
-            thread.spawn(read).expect("a thread can be started");
-        }
-        Self { child, lines }
-    }
-
-    /// The first line to come that has this in it.
-    fn line_with(&self, word: &str) -> String {
-        loop {
-            let line = self.lines.recv_timeout(PATIENCE);
-            let line = line.unwrap_or_else(|error| panic!("no line with {word:?}: {error}"));
-            if line.contains(word) {
-                return line;
-            }
-        }
-    }
-
-    fn interrupt(&self) {
-        let id = self.child.id().to_string();
-        let killed = Command::new("kill").args(["-INT", &id]).status().expect("kill is there");
-        assert!(killed.success());
-    }
-
-    fn exit_code(&mut self) -> Option<i32> {
-        self.child.wait().expect("it was started").code()
-    }
-}
-
-impl Drop for Background {
-    fn drop(&mut self) {
-        self.child.kill().ok();
-        self.child.wait().ok();
-    }
-}
-
-/// The endpoint in a line that tells one.
-fn endpoint(line: &str) -> String {
-    let word = line.split_whitespace().find(|word| word.starts_with("tcp/127.0.0.1:"));
-    word.expect("it listens on loopback").trim_end_matches(',').to_owned()
-}
-
-/// A daemon, and where it listens.
-struct Daemon {
-    background: Background,
-    endpoint: String,
-    _directory: TempDir,
-}
-
 impl Daemon {
-    fn start(prefix: &str) -> Self {
-        Self::start_with(prefix, &[])
-    }
-
-    fn start_with(prefix: &str, arguments: &[&str]) -> Self {
-        let directory = directory();
-        let zenoh = file(&directory, "router.json5", ROUTER);
-        let mut command = program();
-        command.args(["run", "--prefix", prefix, "--zenoh", text(&zenoh), "--threads", "1"]);
-        command.args(arguments).current_dir(directory.path());
-        let background = Background::start(&mut command);
-        let endpoint = endpoint(&background.line_with("listens on"));
-        Self { background, endpoint, _directory: directory }
-    }
-
     /// A second daemon on the same mesh.
     fn join(&self, prefix: &str) -> Background {
         let mut command = program();
@@ -160,31 +29,6 @@ impl Daemon {
         background.line_with("waiting for scans");
         background
     }
-
-    fn play(&self, arguments: &[&str]) -> String {
-        succeed(&[&["play", "-e", &self.endpoint], arguments].concat())
-    }
-}
-
-fn directory() -> TempDir {
-    tempfile::tempdir().expect("a temporary directory can be made")
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().expect("temporary names are text")
-}
-
-fn file(directory: &TempDir, name: &str, content: &str) -> PathBuf {
-    let path = directory.path().join(name);
-    fs::write(&path, content).expect("a temporary directory can be written to");
-    path
-}
-
-/// A drive of 143 s through a corridor.
-fn simulated_log(directory: &TempDir) -> PathBuf {
-    let path = directory.path().join("sim.log");
-    succeed(&["simulate", "--scenario", "corridor", "--beams", "90", "--out", text(&path)]);
-    path
 }
 
 fn sha256(bytes: &[u8]) -> String {

@@ -21,11 +21,13 @@ use gmapd::sim::lidar::Lidar;
 use gmapd::sim::{Simulation, building};
 use gmapd::slam::pose::{Point2, Pose2, Stamp};
 use indicatif::{ProgressBar, ProgressStyle};
+use tokio::task::JoinSet;
 use tokio::time::sleep;
 use zenoh::Session;
 
 use super::feed::Feed;
 use super::mesh;
+use super::view;
 
 /// The world, the robot's errors and the filter's random numbers.
 const SEED: u64 = 1;
@@ -53,6 +55,7 @@ const DAEMON_PATIENCE: Duration = Duration::from_secs(10);
         gmapd doctor -e tcp/127.0.0.1:PORT robot01\n\n\
     Examples:\n  \
         gmapd demo\n  \
+        gmapd demo --view\n  \
         gmapd demo --out /tmp/demo --prefix r2d2 --seconds 60")]
 pub(crate) struct Arguments {
     /// Directory for the map; made if it is not there
@@ -64,10 +67,13 @@ pub(crate) struct Arguments {
     /// Seconds that the robot drives, by its own clock; the whole tour without
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..))]
     seconds: Option<u32>,
+    /// Show it in a browser too: prints the address, which is there until Ctrl-C
+    #[arg(long)]
+    view: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments { out, prefix, seconds } = arguments;
+    let Arguments { out, seconds, .. } = arguments;
     std::fs::create_dir_all(out)
         .with_context(|| format!("cannot make the directory {}", out.display()))?;
     let lidar = Lidar::full_circle(360).context("the laser cannot be simulated")?;
@@ -75,7 +81,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let duration_s = simulation.trajectory.duration_s();
     let duration_s = seconds.map_or(duration_s, |seconds| duration_s.min(f64::from(seconds)));
     let mut drive = Drive { simulation, duration_s, truth: BTreeMap::new() };
-    let last = mesh::block_on(drive.mapped(prefix))?;
+    let last = mesh::block_on(drive.mapped(arguments))?;
     let map = last.map.as_deref().context("no scan was processed, so there is no map")?;
     println!("{}", drive.result(&last, map));
     for path in save(out, map)? {
@@ -96,7 +102,8 @@ struct Drive {
 
 impl Drive {
     /// Drives, with a daemon that maps, and returns what that knows at the end.
-    async fn mapped(&mut self, prefix: &Prefix) -> anyhow::Result<Arc<Snapshot>> {
+    async fn mapped(&mut self, arguments: &Arguments) -> anyhow::Result<Arc<Snapshot>> {
+        let prefix = &arguments.prefix;
         let daemon_session = zenoh::open(router()?).await.map_err(|error| anyhow!(error))?;
         let endpoint = endpoint(&daemon_session).await?;
         let robot_session =
@@ -108,8 +115,21 @@ impl Drive {
         let robot = mesh::name(prefix);
         println!("a simulated robot drives {:.0} s at {SPEED} times its speed", self.duration_s);
         println!("meanwhile: gmapd get -e {endpoint} {robot} map");
+        let mut page = JoinSet::new();
+        if arguments.view {
+            let opened = view::Page::open(([127, 0, 0, 1], 0).into(), robot_session.clone());
+            let opened = opened.await?;
+            println!("look at it: {}", opened.address);
+            page.spawn(opened.serve());
+        }
         tokio::select! {
-            driven = self.drive(&robot_session, prefix, &daemon) => driven?,
+            driven = self.drive(&robot_session, prefix, &daemon) => {
+                driven?;
+                if arguments.view {
+                    println!("the drive is over; the page is there until Ctrl-C");
+                    tokio::signal::ctrl_c().await.context("no signals come")?;
+                }
+            }
             signal = tokio::signal::ctrl_c() => signal.context("no signals come")?,
         }
         let last = daemon.stop().await;

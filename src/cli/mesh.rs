@@ -142,7 +142,7 @@ fn remedy(alive: &[Prefix]) -> String {
 }
 
 /// The robot whose key ends with `name`.
-fn robot_of(key: &str, name: &str) -> Option<Prefix> {
+pub(super) fn robot_of(key: &str, name: &str) -> Option<Prefix> {
     let prefix = key.strip_suffix(name)?;
     let is_whole = prefix.is_empty() || prefix.ends_with('/');
     Prefix::parse(prefix).ok().filter(|_| is_whole)

@@ -18,6 +18,7 @@ mod save;
 mod session;
 mod simulate;
 mod state;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -29,6 +30,7 @@ use clap::{Parser, Subcommand};
         gmapd demo                                     a simulated robot and its map, in a minute\n  \
         gmapd run --prefix robot01                     map live, from scans and odometry on Zenoh\n  \
         gmapd get robot01 map                          a robot's map, drawn\n  \
+        gmapd view                                     the same in a browser\n  \
         gmapd doctor robot01                           what is wrong with its scans and odometry\n  \
         gmapd record robot01 -o run.mcap               what it sends and the map, for later\n  \
         gmapd simulate --out sim.log                   make a log to try\n  \
@@ -58,6 +60,8 @@ pub(crate) enum Command {
     Save(save::Arguments),
     /// List the robots that are alive
     List(list::Arguments),
+    /// Look at robots and their maps in a browser
+    View(view::Arguments),
     /// Watch a robot's input and say what is wrong
     Doctor(doctor::Arguments),
     /// Record what a robot sends and what is made of it
@@ -81,6 +85,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<()> {
         Command::Get(arguments) => get::run(&arguments),
         Command::Save(arguments) => save::run(&arguments),
         Command::List(arguments) => list::run(&arguments),
+        Command::View(arguments) => view::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Record(arguments) => record::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),

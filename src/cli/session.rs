@@ -24,6 +24,11 @@ pub(crate) struct SessionArguments {
 }
 
 impl SessionArguments {
+    /// Connects only; for who has another use for `--listen`.
+    pub(crate) const fn connecting(zenoh: Option<PathBuf>, connect: Vec<String>) -> Self {
+        Self { zenoh, connect, listen: Vec::new() }
+    }
+
     /// Opens the session; nobody answering at `--connect` is an error.
     ///
     /// Zenoh needs tokio's multi-thread runtime.

@@ -70,6 +70,7 @@ mod tests {
             state,
             detail: "no scan has come".to_owned(),
             pose_in_map: Pose2::IDENTITY,
+            laser: None,
             scans: BTreeMap::from([(Verdict::Processed, 3), (Verdict::NoOdometry, 2)]),
             last_details: BTreeMap::new(),
             inputs: BTreeMap::new(),

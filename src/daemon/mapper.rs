@@ -27,6 +27,7 @@ use crate::slam::engine::{Engine, Sweep};
 use crate::slam::gmapping::ThreadsError;
 use crate::slam::odometry::JumpGuard;
 use crate::slam::pose::{Pose2, Stamp};
+use crate::slam::scan::LaserMount;
 use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate, WeakDirection};
 use crate::statistics::Spread;
 use crate::tf::{Kind, TfCounts, Transform};
@@ -59,6 +60,8 @@ pub struct Gauges {
     /// Scans that wait for odometry.
     #[serde(skip)]
     pub scans_waiting: usize,
+    /// How the laser of the last scan sits.
+    pub laser: Option<LaserMount>,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
     /// Where odometry comes from.
@@ -367,6 +370,7 @@ impl Mapper {
             self.view.odom_from_base = None;
             self.gauges.without_odometry += 1;
         }
+        self.gauges.laser = Some(*mount);
         let sweep = Sweep { scan, mount, odom_from_base };
         let watch = Stopwatch::start();
         match self.engine.add_scan(&sweep, &mut |_| ()) {

@@ -20,6 +20,7 @@ use super::synchronizer::Channel;
 use crate::clock;
 use crate::config::{EngineKind, RawConfig};
 use crate::slam::pose::Pose2;
+use crate::slam::scan::LaserMount;
 use crate::slam::update::WeakDirection;
 use crate::statistics::Spread;
 use crate::timeline::TimelineCounts;
@@ -41,6 +42,8 @@ pub struct Status {
     pub detail: String,
     /// The pose of the base in `map`.
     pub pose_in_map: Pose2,
+    /// How the laser of the last scan sits on the base; `null` before the first.
+    pub laser: Option<LaserMount>,
     /// Scans by verdict; all verdicts are there.
     pub scans: BTreeMap<Verdict, u64>,
     /// The last detail of each verdict that had one.
@@ -212,6 +215,7 @@ impl StatusSource {
             state,
             detail,
             pose_in_map: snapshot.estimate.pose_in_map,
+            laser: gauges.laser,
             scans: Verdict::ALL.into_iter().map(|v| (v, ledger.count(v))).collect(),
             last_details: details.map(|(v, entry)| (*v, entry.detail.clone())).collect(),
             inputs,

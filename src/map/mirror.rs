@@ -56,6 +56,22 @@ impl MirroredMap {
         self.tiles.len()
     }
 
+    /// Size, place and version.
+    #[must_use]
+    pub const fn head(&self) -> Head {
+        self.head
+    }
+
+    /// The tiles with a known cell, as they are sent on, with the version of the whole.
+    pub fn entries(&self) -> impl Iterator<Item = Entry> + '_ {
+        self.tiles.iter().map(|(index, tile)| Entry {
+            index: *index,
+            version: self.head.version,
+            hash: tile.hash,
+            data: tile.data.clone(),
+        })
+    }
+
     /// The map cell by cell, as the daemon has it; without cells before the first scan.
     #[must_use]
     pub fn grid(&self) -> OccupancyGrid {

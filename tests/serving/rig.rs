@@ -115,6 +115,7 @@ fn status() -> Status {
         state: State::WaitingForOdometry,
         detail: "odometry is missing".to_owned(),
         pose_in_map: Pose2::IDENTITY,
+        laser: None,
         scans: BTreeMap::new(),
         last_details: BTreeMap::new(),
         inputs: BTreeMap::new(),
