@@ -161,6 +161,7 @@ impl Responder {
             Question::Pause => self.command(Command::Pause),
             Question::Resume => self.command(Command::Resume),
             Question::InitialPose(pose) => self.command(Command::InitialPose(*pose)),
+            Question::Mode(mode) => self.command(Command::Mode(*mode)),
             Question::Save(name) => self.save(&snapshot, name),
         }
     }

@@ -9,9 +9,9 @@ use crate::ros;
 /// The status of the robot as a message; its stamp is zero, for no sensor took it.
 pub(super) fn diagnostics(status: &Status, robot: &str) -> ros::DiagnosticArray {
     let level = match status.state {
-        State::Mapping => ros::DiagnosticStatus::OK,
+        State::Mapping | State::Localizing => ros::DiagnosticStatus::OK,
         State::Degraded | State::Paused => ros::DiagnosticStatus::WARN,
-        State::WaitingForOdometry => ros::DiagnosticStatus::ERROR,
+        State::WaitingForOdometry | State::NotLocalized => ros::DiagnosticStatus::ERROR,
         State::WaitingForScans => ros::DiagnosticStatus::STALE,
     };
     let status = ros::DiagnosticStatus {

@@ -12,6 +12,7 @@ use super::save::{NameError, SaveName};
 use super::tiles::TilesQuestion;
 use crate::map::region::{Layer, Window};
 use crate::map::tiles::TileIndex;
+use crate::slam::known_map::Mode;
 use crate::slam::pose::{Point2, Pose2, Stamp, wrap_angle};
 
 /// Columns of a map drawn with characters, unless asked otherwise.
@@ -63,13 +64,15 @@ pub enum Topic {
     Resume,
     /// Say where the robot is.
     InitialPose,
+    /// Let scans enter the map, or freeze it.
+    Mode,
     /// Write the map to files.
     Save,
 }
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -83,6 +86,7 @@ impl Topic {
         Self::Pause,
         Self::Resume,
         Self::InitialPose,
+        Self::Mode,
         Self::Save,
     ];
 
@@ -103,6 +107,7 @@ impl Topic {
             Self::Pause => "slam/cmd/pause",
             Self::Resume => "slam/cmd/resume",
             Self::InitialPose => "slam/cmd/initial_pose",
+            Self::Mode => "slam/cmd/mode",
             Self::Save => "slam/cmd/save",
         }
     }
@@ -110,7 +115,11 @@ impl Topic {
     /// Whether asking changes something, so that it must not happen by a wildcard.
     #[must_use]
     pub const fn is_command(self) -> bool {
-        matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::InitialPose | Self::Save)
+        match self {
+            Self::Reset | Self::Pause | Self::Resume => true,
+            Self::InitialPose | Self::Mode | Self::Save => true,
+            _ => false,
+        }
     }
 
     /// Whether the answer may be megabytes, which take their time on the network.
@@ -149,6 +158,11 @@ impl Topic {
             Self::InitialPose => {
                 let pose = of(&["x", "y", "yaw"])?.pose()?;
                 Question::InitialPose(pose.ok_or(SelectorError::NoPose)?)
+            }
+            Self::Mode => {
+                let modes = [("mapping", Mode::Mapping), ("localization", Mode::Localization)];
+                let mode = of(&["mode"])?.choice("mode", &modes)?;
+                Question::Mode(mode.ok_or(SelectorError::NoMode)?)
             }
             Self::Save => {
                 let parameters = of(&["name"])?;
@@ -195,6 +209,8 @@ pub enum Question {
     Resume,
     /// The base is at this pose in `map`.
     InitialPose(Pose2),
+    /// Scans enter the map, or do not.
+    Mode(Mode),
     /// Write the map to files of this name.
     Save(SaveName),
 }
@@ -317,6 +333,9 @@ pub enum SelectorError {
     /// No pose where one is needed.
     #[error("a pose is needed: x and y in metres and yaw in radians, as in x=1.5;y=-2;yaw=0.5")]
     NoPose,
+    /// No mode where one is needed.
+    #[error("a mode is needed: mode=mapping or mode=localization")]
+    NoMode,
     /// No name for files.
     #[error(transparent)]
     Name(#[from] NameError),

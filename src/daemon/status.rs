@@ -16,6 +16,7 @@ use super::mapper::Gauges;
 use super::snapshot::{MapVersion, Snapshot, State};
 use super::synchronizer::Channel;
 use crate::clock;
+use crate::slam::known_map::Mode;
 use crate::slam::pose::Pose2;
 use crate::slam::update::WeakDirection;
 use crate::statistics::Spread;
@@ -32,6 +33,8 @@ pub struct Status {
     pub state: State,
     /// In a sentence, with what to do where something is wrong.
     pub detail: String,
+    /// Whether scans enter the map.
+    pub mode: Mode,
     /// The pose of the base in `map`.
     pub pose_in_map: Pose2,
     /// Scans by verdict; all verdicts are there.
@@ -183,6 +186,7 @@ impl StatusSource {
             version: env!("CARGO_PKG_VERSION"),
             uptime_s: self.uptime_s(),
             state,
+            mode: snapshot.mode,
             detail,
             pose_in_map: snapshot.estimate.pose_in_map,
             scans: Verdict::ALL.into_iter().map(|v| (v, ledger.count(v))).collect(),
