@@ -87,6 +87,8 @@ pub(crate) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let config = load_config(arguments)?;
+    let threads = arguments.threads.get();
+    let replay = Replay::new(&config, threads)?;
     // Where a file gives poses, the log's odometry is odometry.
     let of_log = match arguments.poses {
         Some(_) => config.clone(),
@@ -98,9 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         std::fs::create_dir_all(directory)
             .with_context(|| format!("cannot make the directory {}", directory.display()))?;
     }
-    let threads = arguments.threads.get();
     let watch = Stopwatch::start();
-    let replay = Replay::new(&config, threads)?;
     let outcome = match poses(arguments, &config)? {
         Poses::Odometry => along_odometry(&log, &config, replay)?,
         Poses::OfLog => along_corrected_poses(&log, &config, replay)?,

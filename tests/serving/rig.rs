@@ -99,6 +99,7 @@ pub(crate) fn nothing() -> Snapshot {
         milliseconds_per_scan: None,
         resamples: 0,
         paused: false,
+        mode: Mode::Mapping,
         map: None,
     }
 }
