@@ -9,6 +9,7 @@
 //! - [`ros`]: ROS 2 messages and their bytes;
 //! - [`convert`]: from messages to the core and back;
 //! - [`timeline`], [`tf`]: odometry and frames between two messages;
+//! - [`starting`]: the engine as configured, on the map it starts from;
 //! - [`replay`]: a log through the filter, and what came of it;
 //! - [`playback`]: a log as live messages;
 //! - [`doctor`]: what is wrong with a robot's scans and odometry;
@@ -39,6 +40,7 @@ pub mod replay;
 pub mod ros;
 pub mod sim;
 pub mod slam;
+pub mod starting;
 pub mod statistics;
 pub mod tf;
 pub mod timeline;

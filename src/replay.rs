@@ -20,12 +20,12 @@ use crate::convert;
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
 use crate::slam::engine::{Engine, Sweep};
-use crate::slam::gmapping::ThreadsError;
 use crate::slam::grid::occupancy::OccupancyGrid;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
 use crate::slam::update::{OdometryUpdate, Phase, ScanReport, ScanUpdate, SkipReason};
+use crate::starting::{self, StartError};
 
 /// An engine that is fed with readings, and what came of each.
 #[derive(Debug)]
@@ -46,10 +46,10 @@ impl Replay {
     /// An engine as configured, before its first reading.
     ///
     /// # Errors
-    /// When the threads cannot be started.
-    pub fn new(config: &Config, threads: usize) -> Result<Self, ThreadsError> {
+    /// When the map to start from cannot be used, or the threads cannot be started.
+    pub fn new(config: &Config, threads: usize) -> Result<Self, StartError> {
         Ok(Self {
-            engine: Engine::new(config.engine_parameters(), threads)?,
+            engine: starting::engine(config, threads)?,
             source: config.raw.odometry_source,
             weak: 0,
             mount: config.laser_mount(),
@@ -203,7 +203,7 @@ pub struct Outcome {
 /// What became of a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Verdict {
-    /// Its scan is in the map.
+    /// Its scan is in the map, or was placed in a map that is frozen.
     Processed,
     /// The robot had not moved enough since the last processed scan.
     NotMovedEnough,
@@ -213,6 +213,8 @@ pub enum Verdict {
     NoUsableBeams,
     /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
+    /// Where in the known map its scan was taken cannot be told.
+    NotLocalized,
     /// The angles or limits of its scan are none when written with the digits of a message.
     BadGeometry,
     /// It has no scan.
@@ -226,6 +228,7 @@ impl From<SkipReason> for Verdict {
             SkipReason::NotMovedEnough => Self::NotMovedEnough,
             SkipReason::NoUsableBeams => Self::NoUsableBeams,
             SkipReason::BadOdometry => Self::BadOdometry,
+            SkipReason::NotLocalized => Self::NotLocalized,
         }
     }
 }

@@ -66,7 +66,7 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 21] = [
+const MAY_USE: [(&str, &[&str]); 22] = [
     ("slam", &[]),
     ("checkpoint", &["files", "slam"]),
     ("sim", &["slam"]),
@@ -77,7 +77,11 @@ const MAY_USE: [(&str, &[&str]); 21] = [
     ("timeline", &["slam"]),
     ("tf", &["slam", "timeline"]),
     ("given_poses", &["evaluation", "slam", "timeline"]),
-    ("replay", &["clock", "config", "convert", "evaluation", "logs", "slam", "statistics"]),
+    ("starting", &["config", "map", "slam"]),
+    (
+        "replay",
+        &["clock", "config", "convert", "evaluation", "logs", "slam", "starting", "statistics"],
+    ),
     ("recorded", &["clock", "config", "convert", "daemon", "logs", "ros", "slam", "tf"]),
     // Its tests read what the daemon writes.
     ("playback", &["convert", "daemon", "logs", "ros", "slam"]),
@@ -103,6 +107,7 @@ const MAY_USE: [(&str, &[&str]); 21] = [
             "ros",
             "sim",
             "slam",
+            "starting",
             "statistics",
             "tf",
             "timeline",

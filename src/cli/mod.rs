@@ -17,6 +17,7 @@ mod run;
 mod save;
 mod session;
 mod simulate;
+mod start;
 mod state;
 mod view;
 

@@ -23,6 +23,7 @@ use sha2::{Digest as _, Sha256};
 
 use super::log::{Along, Log, Refusals, TopicArguments};
 use super::progress::Progress;
+use super::start::StartArguments;
 
 /// What to replay, and how.
 #[derive(Debug, Args)]
@@ -45,6 +46,7 @@ use super::progress::Progress;
         gmapd replay run.mcap --expect 1f0a5c...   (the map's hash, as a replay prints it)\n  \
         gmapd replay intel.log.gz --config config/gmapd.yaml --set maxUrange=40 --out out\n  \
         gmapd replay intel.log --engine known_poses --poses out/trajectory.tum --out again\n  \
+        gmapd replay next.log --map out/map.yaml --initial-pose search --mode localization\n  \
         gmapd replay intel.log --set particles=30 --set delta=0.1 --seed 7 --json")]
 pub(crate) struct Arguments {
     /// Recorded log
@@ -70,6 +72,8 @@ pub(crate) struct Arguments {
     /// Seed of the random numbers; the same as --set seed=N
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    #[command(flatten)]
+    start: StartArguments,
     /// Threads of the filter; the result is the same for any number
     #[arg(long, value_name = "N", default_value = "1")]
     threads: NonZeroUsize,
@@ -83,6 +87,8 @@ pub(crate) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let config = load_config(arguments)?;
+    let threads = arguments.threads.get();
+    let replay = Replay::new(&config, threads)?;
     // Where a file gives poses, the log's odometry is odometry.
     let of_log = match arguments.poses {
         Some(_) => config.clone(),
@@ -94,9 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         std::fs::create_dir_all(directory)
             .with_context(|| format!("cannot make the directory {}", directory.display()))?;
     }
-    let threads = arguments.threads.get();
     let watch = Stopwatch::start();
-    let replay = Replay::new(&config, threads)?;
     let outcome = match poses(arguments, &config)? {
         Poses::Odometry => along(Along::Odometry, &log, &config, replay)?,
         Poses::OfLog => along(Along::CorrectedPoses, &log, &config, replay)?,
@@ -129,6 +133,7 @@ fn load_config(arguments: &Arguments) -> anyhow::Result<Config> {
     let mut overrides = arguments.set.clone();
     overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
+    overrides.extend(arguments.start.overrides());
     let config = Config::load(arguments.config.as_deref(), &overrides)?;
     for warning in &config.warnings {
         eprintln!("warning: {warning}");
@@ -344,6 +349,7 @@ fn readings(summary: &Summary) -> String {
         (counts.throttled, "throttled"),
         (counts.no_usable_beams, "without usable beams"),
         (counts.bad_odometry, "with bad odometry"),
+        (counts.not_localized, "not localized"),
         (counts.bad_geometry, "with bad geometry"),
         (counts.odometry_only, "odometry only"),
         (counts.jump_rejected, "jumps rejected"),

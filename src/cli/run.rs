@@ -10,12 +10,14 @@ use clap::Args;
 use gmapd::config::Config;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::{self, Settings};
+use gmapd::starting;
 use tokio::runtime::Handle;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::spawn_blocking;
 use tracing_subscriber::EnvFilter;
 
 use super::session::SessionArguments;
+use super::start::StartArguments;
 
 /// What is logged if nothing is said: Zenoh tells more than an operator wants to know.
 const LOG_FILTER: &str = "warn,gmapd=info";
@@ -41,6 +43,10 @@ const LAST_BREATH: Duration = Duration::from_millis(100);
         gmapd run --config config/gmapd.yaml --set laser='{x: 0.2}' -l tcp/0.0.0.0:7447\n  \
         gmapd run --prefix robot01 --state /var/lib/gmapd\n                                                 \
         goes on where it was, after a crash too\n\n\
+    Going on in a map that was saved:\n  \
+        gmapd run --map maps/office.yaml                        from where the first scan fits\n  \
+        gmapd run --map maps/office.yaml --initial-pose 1.5,-2,0.5\n  \
+        gmapd run --map maps/office.yaml --mode localization    the map stays as it is\n\n\
     Then, from anywhere on the mesh:\n  \
         gmapd get robot01 status                       what it does, and why the map does not grow\n\n\
     Exit codes: 0 ended by a signal, 1 failed, 2 wrong usage, 130 ended by a second signal.")]
@@ -66,6 +72,8 @@ pub(crate) struct Arguments {
     /// Keep the state in DIR, and go on from there after a restart; the same as state_directory
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
+    #[command(flatten)]
+    start: StartArguments,
     #[command(flatten)]
     mesh: SessionArguments,
 }
@@ -102,6 +110,7 @@ fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
     let mut overrides = arguments.set.clone();
     overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
+    overrides.extend(arguments.start.overrides());
     let mut config = Config::load(arguments.config.as_deref(), &overrides)?;
     if let Some(directory) = &arguments.state {
         let text = directory.to_str().context("the path of --state is not UTF-8")?;
@@ -113,6 +122,8 @@ fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
     if cfg!(debug_assertions) {
         tracing::warn!("this is a debug build, many times slower than a release build");
     }
+    // Told before the mesh is waited for.
+    starting::known_map(&config)?;
     let prefix = Prefix::parse(arguments.prefix.as_deref().unwrap_or(&config.raw.prefix))?;
     let threads = arguments.threads.map_or_else(std::thread::available_parallelism, Ok);
     // A system that does not say has one.

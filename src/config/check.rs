@@ -5,8 +5,9 @@ use std::fmt;
 use serde_json::{Map, Value};
 
 use super::ConfigError;
-use super::raw::{EngineKind, OdometrySource, RawConfig};
+use super::raw::{EngineKind, InitialPose, OdometrySource, RawConfig};
 use super::source::{Entries, Origin};
+use crate::slam::known_map::Mode;
 
 /// A name this similar to an unknown one is suggested (Jaro-Winkler, 1 is equal).
 const SIMILAR: f64 = 0.75;
@@ -46,7 +47,21 @@ fn check_together(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError>
         let allowed = format!("more than laser_min_dist, which is {}", raw.laser_min_dist);
         return Err(out_of_range(entries, key, value, allowed));
     }
-    Ok(())
+    check_start(entries, raw)
+}
+
+/// What a map to start from is needed for, and who takes none.
+fn check_start(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError> {
+    let localizes = raw.mode == Mode::Localization;
+    let searches = matches!(raw.initial_pose, Some(InitialPose::Search(_)));
+    let (key, reason) = match (raw.engine, &raw.map) {
+        (EngineKind::KnownPoses, Some(_)) => ("map", "known_poses starts from no map"),
+        (EngineKind::KnownPoses, None) if localizes => ("mode", "to known_poses, poses are given"),
+        (_, None) if localizes => ("mode", "a map to localize in is needed: --map, or map"),
+        (_, None) if searches => ("initial_pose", "a map to search is needed: --map, or map"),
+        _ => return Ok(()),
+    };
+    Err(wrong_kind(entries, key, reason))
 }
 
 fn check_keys(entries: &Entries) -> Result<(), ConfigError> {
@@ -207,7 +222,8 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("sweep_time_s", raw.sweep_time_s, Between(0.0, 1.0)),
     ];
     limits.extend(optional.into_iter().filter_map(|(key, value, of)| Some((key, value?, of))));
-    let poses = raw.initial_pose.into_iter().flatten().map(|value| ("initial_pose", value, Finite));
+    let pose = raw.initial_pose.and_then(InitialPose::numbers);
+    let poses = pose.into_iter().flatten().map(|value| ("initial_pose", value, Finite));
     limits.extend(poses);
     let laser = raw.laser.into_iter().flat_map(|laser| [laser.x, laser.y, laser.yaw]);
     limits.extend(laser.map(|value| ("laser", value, Finite)));

@@ -15,8 +15,8 @@ use serde_json::Value;
 use thiserror::Error;
 
 pub use raw::{
-    Checkpoint, CommandName, EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher,
-    OdometrySource, RawConfig, RosDistro, Smoothing,
+    Checkpoint, CommandName, EngineKind, InitialPose, Interop, Jump, Keys, Laser, MapOf, Matcher,
+    OdometrySource, RawConfig, RosDistro, Search, Smoothing,
 };
 pub use source::Origin;
 
@@ -119,13 +119,14 @@ impl Config {
     #[must_use]
     pub fn parameters(&self) -> Parameters {
         let raw = &self.raw;
+        let initial_pose = raw.initial_pose.and_then(InitialPose::numbers);
         Parameters {
             particles: raw.particles,
             throttle_scans: raw.throttle_scans,
             resolution: raw.resolution,
             max_range: raw.max_range,
             max_usable_range: raw.max_usable_range,
-            initial_pose: raw.initial_pose.map(|[x, y, yaw]| Pose2::new(x, y, yaw)),
+            initial_pose: initial_pose.map(|[x, y, yaw]| Pose2::new(x, y, yaw)),
             motion_noise: MotionNoise {
                 translation_from_translation: raw.translation_noise_from_translation,
                 translation_from_rotation: raw.translation_noise_from_rotation,
@@ -148,6 +149,15 @@ impl Config {
                 occupied_threshold: occupied_threshold(raw),
                 free_on_no_return: raw.free_on_no_return,
             },
+        }
+    }
+
+    /// When a cell of the engine's map is occupied.
+    #[must_use]
+    pub fn occupied_threshold(&self) -> OccupiedThreshold {
+        match self.raw.engine {
+            EngineKind::Hector => hector::OCCUPIED_THRESHOLD,
+            EngineKind::Gmapping | EngineKind::KnownPoses => occupied_threshold(&self.raw),
         }
     }
 

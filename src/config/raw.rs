@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::{gmapping::Parameters, hector};
+use crate::slam::{gmapping::Parameters, hector, known_map::Mode};
 
 /// All keys of the file. A key that is left out has slam_gmapping's default.
 ///
@@ -13,6 +13,10 @@ use crate::slam::{gmapping::Parameters, hector};
 pub struct RawConfig {
     /// Which system maps.
     pub engine: EngineKind,
+    /// Whether scans enter the map.
+    pub mode: Mode,
+    /// YAML file of a map to start from; left out, nothing is known.
+    pub map: Option<String>,
     /// Known poses: what the map is of.
     pub map_of: MapOf,
     /// Number of hypotheses.
@@ -144,8 +148,9 @@ pub struct RawConfig {
     pub jump_max_step_m: f64,
     /// What happens at a jump.
     pub jump_policy: Jump,
-    /// Pose of the base in `map` at the first scan: m, m, rad; left out, odometry's.
-    pub initial_pose: Option<[f64; 3]>,
+    /// Pose of the base in `map` at the first scan: m, m, rad; left out, odometry's, or searched
+    /// for in the map to start from.
+    pub initial_pose: Option<InitialPose>,
     /// How the laser sits on the robot; left out, what the log or the transforms say.
     pub laser: Option<Laser>,
 
@@ -288,6 +293,8 @@ impl Default for RawConfig {
         let hector = hector::Parameters::default();
         Self {
             engine: EngineKind::Gmapping,
+            mode: Mode::Mapping,
+            map: None,
             map_of: MapOf::AllScans,
             sweep_time_s: None,
             particles: core.particles,
@@ -379,6 +386,35 @@ pub enum EngineKind {
     KnownPoses,
 }
 
+/// Where the first scan was taken.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "[x, y, yaw] or search is needed")]
+pub enum InitialPose {
+    /// There: m, m, rad.
+    At([f64; 3]),
+    /// Where it fits in the map to start from.
+    Search(Search),
+}
+
+/// The word that asks for a search.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Search {
+    /// In the whole map.
+    Search,
+}
+
+impl InitialPose {
+    /// The numbers, if there are any.
+    #[must_use]
+    pub const fn numbers(self) -> Option<[f64; 3]> {
+        match self {
+            Self::At(numbers) => Some(numbers),
+            Self::Search(_) => None,
+        }
+    }
+}
+
 /// What the map along known poses is of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -439,6 +475,8 @@ pub enum CommandName {
     Checkpoint,
     /// Say where the robot is.
     InitialPose,
+    /// Let scans enter the map, or freeze it.
+    Mode,
     /// Take no scans.
     Pause,
     /// Forget map and trajectory.
@@ -451,8 +489,15 @@ pub enum CommandName {
 
 impl CommandName {
     /// All of them.
-    pub const ALL: [Self; 6] =
-        [Self::Checkpoint, Self::InitialPose, Self::Pause, Self::Reset, Self::Resume, Self::Save];
+    pub const ALL: [Self; 7] = [
+        Self::Checkpoint,
+        Self::InitialPose,
+        Self::Mode,
+        Self::Pause,
+        Self::Reset,
+        Self::Resume,
+        Self::Save,
+    ];
 }
 
 /// How often the state is written, and how many of those writings are kept.

@@ -173,6 +173,7 @@ impl Responder {
             Question::Resume => self.command(Command::Resume),
             Question::InitialPose(pose) => self.command(Command::InitialPose(*pose)),
             Question::Checkpoint => self.checkpoint(),
+            Question::Mode(mode) => self.command(Command::Mode(*mode)),
             Question::Save(name) => self.save(&snapshot, name),
         }
     }

@@ -3,6 +3,7 @@
 use serde::Serialize;
 use tokio::sync::oneshot;
 
+use crate::slam::known_map::Mode;
 use crate::slam::pose::Pose2;
 
 /// A command that changes the filter; saving and asking need no command, for the snapshot has all.
@@ -19,6 +20,8 @@ pub enum Command {
     Checkpoint,
     /// The robot is here: before the first scan, where the map begins; later, all particles move.
     InitialPose(Pose2),
+    /// Scans enter the map, or do not.
+    Mode(Mode),
 }
 
 /// What was done, for the reply.

@@ -9,9 +9,9 @@ use crate::ros;
 /// The status of the robot as a message; its stamp is zero, for no sensor took it.
 pub(super) fn diagnostics(status: &Status, robot: &str) -> ros::DiagnosticArray {
     let level = match status.state {
-        State::Mapping => ros::DiagnosticStatus::OK,
+        State::Mapping | State::Localizing => ros::DiagnosticStatus::OK,
         State::Degraded | State::Paused => ros::DiagnosticStatus::WARN,
-        State::WaitingForOdometry => ros::DiagnosticStatus::ERROR,
+        State::WaitingForOdometry | State::NotLocalized => ros::DiagnosticStatus::ERROR,
         State::WaitingForScans => ros::DiagnosticStatus::STALE,
     };
     let status = ros::DiagnosticStatus {
@@ -58,6 +58,7 @@ mod tests {
     use crate::daemon::ledger::Verdict;
     use crate::daemon::links::LinksStatus;
     use crate::daemon::status::FilterStatus;
+    use crate::slam::known_map::Mode;
     use crate::slam::pose::Pose2;
     use crate::statistics::Spread;
 
@@ -65,6 +66,7 @@ mod tests {
         Status {
             engine: EngineKind::Gmapping,
             links: LinksStatus::default(),
+            mode: Mode::Mapping,
             version: "0.0.0",
             uptime_s: 1.0,
             state,

@@ -6,6 +6,7 @@ use super::ledger::Verdict;
 use super::mapper::Gauges;
 use super::snapshot::{Snapshot, State};
 use super::status::InputStatus;
+use crate::slam::known_map::Mode;
 use crate::slam::update::WeakDirection;
 
 /// Scans that come less often than this, s, have stopped coming.
@@ -36,6 +37,7 @@ pub(super) fn judge(now: &Circumstances<'_>) -> (State, String) {
     }
     waiting_for_scans(now)
         .or_else(|| waiting_for_odometry(now))
+        .or_else(|| not_localized(now))
         .or_else(|| unusable_scans(now))
         .or_else(|| overload(now))
         .or_else(|| no_match(now))
@@ -69,6 +71,14 @@ fn waiting_for_odometry(now: &Circumstances<'_>) -> Option<(State, String)> {
         return None;
     }
     Some((State::WaitingForOdometry, "the first scan waits for its odometry".to_owned()))
+}
+
+fn not_localized(now: &Circumstances<'_>) -> Option<(State, String)> {
+    if now.gauges.recent.back() != Some(&Verdict::NotLocalized) {
+        return None;
+    }
+    let detail = &now.snapshot.ledger.last().get(&Verdict::NotLocalized)?.detail;
+    Some((State::NotLocalized, detail.clone()))
 }
 
 fn unusable_scans(now: &Circumstances<'_>) -> Option<(State, String)> {
@@ -131,12 +141,27 @@ fn weak_direction(now: &Circumstances<'_>) -> Option<(State, String)> {
     } else {
         "and without odometry the map may shrink there"
     };
-    let state = if has_odometry { State::Mapping } else { State::Degraded };
+    let state = if has_odometry { working(now) } else { State::Degraded };
     Some((state, format!("the scans do not tell {what}, as in a plain corridor: {who}")))
+}
+
+/// What goes on where nothing is wrong.
+const fn working(now: &Circumstances<'_>) -> State {
+    match now.snapshot.mode {
+        Mode::Mapping => State::Mapping,
+        Mode::Localization => State::Localizing,
+    }
 }
 
 fn mapping(now: &Circumstances<'_>) -> (State, String) {
     let processed = now.snapshot.ledger.count(Verdict::Processed);
+    if now.snapshot.mode == Mode::Localization {
+        let detail = format!(
+            "the map stays as it is; {processed} scans are processed; slam/cmd/mode?mode=mapping \
+             lets them enter it again"
+        );
+        return (State::Localizing, detail);
+    }
     let detail = match now.gauges.recent.back() {
         Some(Verdict::NotMovedEnough) => format!(
             "{processed} scans are mapped; the robot has not moved by linearUpdate or \

@@ -22,6 +22,8 @@ pub enum Verdict {
     NoUsableBeams,
     /// Its odometry is not finite, or further away than a robot gets.
     BadOdometry,
+    /// Where in the map that mapping starts from it was taken cannot be told.
+    NotLocalized,
     /// Odometry for its stamp did not come in time, or no pose is given to map along.
     NoOdometry,
     /// Where the laser sits on the robot is not known.
@@ -44,12 +46,13 @@ pub enum Verdict {
 
 impl Verdict {
     /// All verdicts, so that a count of zero is told too.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Processed,
         Self::NotMovedEnough,
         Self::Throttled,
         Self::NoUsableBeams,
         Self::BadOdometry,
+        Self::NotLocalized,
         Self::NoOdometry,
         Self::NoMount,
         Self::TiltedMount,
@@ -69,6 +72,7 @@ impl From<SkipReason> for Verdict {
             SkipReason::NotMovedEnough => Self::NotMovedEnough,
             SkipReason::NoUsableBeams => Self::NoUsableBeams,
             SkipReason::BadOdometry => Self::BadOdometry,
+            SkipReason::NotLocalized => Self::NotLocalized,
         }
     }
 }

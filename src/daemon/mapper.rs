@@ -24,11 +24,12 @@ use crate::clock::{self, Stopwatch};
 use crate::config::{Config, EngineKind, OdometrySource};
 use crate::convert::FramedPose;
 use crate::slam::engine::{Engine, Sweep};
-use crate::slam::gmapping::ThreadsError;
+use crate::slam::known_map::Mode;
 use crate::slam::odometry::JumpGuard;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::LaserMount;
 use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate, WeakDirection};
+use crate::starting::{self, StartError};
 use crate::statistics::Spread;
 use crate::tf::{Kind, TfCounts, Transform};
 use crate::timeline::TimelineCounts;
@@ -38,6 +39,9 @@ const TIMED_SCANS: usize = 1000;
 
 /// Verdicts and matches that tell how it goes at the moment.
 const RECENT: usize = 50;
+
+/// How to tell where the robot is.
+const SAY_WHERE: &str = "slam/cmd/initial_pose?x=1.5;y=-2;yaw=0.5";
 
 /// What the filter's thread works with.
 #[derive(Debug)]
@@ -99,6 +103,7 @@ pub struct Mapper {
     engine: Engine,
     /// As configured: where the first scan is, and what a jump is.
     initial_pose: Option<Pose2>,
+    first_mode: Mode,
     jump: JumpGuard,
     /// Seconds between two versions of the map while scans wait.
     map_update_interval: f64,
@@ -119,6 +124,7 @@ pub struct Mapper {
 struct View {
     ledger: Ledger,
     paused: bool,
+    mode: Mode,
     resamples: u64,
     times: VecDeque<f64>,
     milliseconds_per_scan: Option<Spread>,
@@ -151,6 +157,7 @@ impl View {
         Self {
             ledger: Ledger::default(),
             paused: false,
+            mode: Mode::Mapping,
             resamples: 0,
             times: VecDeque::new(),
             milliseconds_per_scan: None,
@@ -172,6 +179,7 @@ impl View {
             milliseconds_per_scan: self.milliseconds_per_scan,
             resamples: self.resamples,
             paused: self.paused,
+            mode: self.mode,
             map: self.map.clone(),
         }
     }
@@ -187,20 +195,21 @@ impl Mapper {
     /// A filter before its first scan.
     ///
     /// # Errors
-    /// When the filter's threads cannot be started.
+    /// When the map to start from cannot be used, or the filter's threads cannot be started.
     pub fn new(
         connections: Connections,
         config: &Config,
         keys: &InputKeys,
         threads: usize,
-    ) -> Result<Self, ThreadsError> {
+    ) -> Result<Self, StartError> {
         let config = &config.with_poses_as_odometry();
         let parameters = config.parameters();
-        let engine = Engine::new(config.engine_parameters(), threads)?;
+        let engine = starting::engine(config, threads)?;
         let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
             initial_pose: parameters.initial_pose,
+            first_mode: config.raw.mode,
             jump: parameters.jump,
             map_update_interval: config.raw.map_update_interval,
             synchronizer: synchronizer(config, keys, need),
@@ -212,9 +221,19 @@ impl Mapper {
             untold: Vec::new(),
             keeper: None,
         };
+        mapper.show_start();
         mapper.renew_estimate(None);
         mapper.publish();
         Ok(mapper)
+    }
+
+    /// A map to start from is told before any scan, so that a pose can be pointed at.
+    fn show_start(&mut self) {
+        self.view.mode = self.engine.mode();
+        if self.engine.occupancy().counts().tiles().next().is_some() {
+            self.view.unpublished = Some(Stamp(0));
+            self.renew_map();
+        }
     }
 
     /// Works until the mailbox is closed and empty, or later than it may be.
@@ -382,7 +401,15 @@ impl Mapper {
             ScanUpdate::Skipped(reason) => {
                 let verdict = Verdict::from(reason);
                 self.renew_estimate(Some(scan.stamp));
-                self.enter(Some(scan.stamp), verdict, detail(verdict, ready));
+                let detail = match self.engine.obstacle() {
+                    Some(obstacle) if verdict == Verdict::NotLocalized => {
+                        format!(
+                            "{obstacle}; the next scan tries again, or say where the robot is: {SAY_WHERE}"
+                        )
+                    }
+                    _ => detail(verdict, ready),
+                };
+                self.enter(Some(scan.stamp), verdict, detail);
             }
         }
     }
@@ -410,7 +437,8 @@ impl Mapper {
         push_bounded(&mut self.gauges.weakness, report.weak_direction, RECENT);
         self.view.estimate.report = Some(report);
         self.renew_estimate(Some(stamp));
-        if registered {
+        // A map that stays as it is has a longer path.
+        if registered || self.view.mode == Mode::Localization {
             self.view.unpublished = Some(stamp);
         }
         let last = self.view.map.as_ref().map(|map| stamp.seconds_since(map.stamp));
@@ -473,6 +501,7 @@ impl Mapper {
             Command::Resume => self.resume(),
             Command::Reset(pose_in_map) => self.reset(pose_in_map),
             Command::InitialPose(pose_in_map) => self.set_pose(pose_in_map),
+            Command::Mode(mode) => self.set_mode(mode),
         };
         tracing::info!(command = ?request.command, done, "command");
         self.view.changed = true;
@@ -497,9 +526,29 @@ impl Mapper {
         (done.to_owned(), changed)
     }
 
+    fn set_mode(&mut self, mode: Mode) -> (String, bool) {
+        if matches!(self.engine, Engine::KnownPoses(_)) {
+            return ("poses are given to this engine, and it always maps".to_owned(), false);
+        }
+        if mode == Mode::Localization && self.view.map.is_none() && !self.engine.has_begun() {
+            return ("there is no map yet to localize in; mapping goes on".to_owned(), false);
+        }
+        // The scans so far belong to the map that is handed out from now on.
+        self.renew_map();
+        let changed = self.engine.mode() != mode;
+        self.engine.set_mode(mode);
+        self.view.mode = self.engine.mode();
+        let done = match mode {
+            Mode::Mapping => "scans enter the map",
+            Mode::Localization => "the map stays as it is, and poses in it are estimated",
+        };
+        (if changed { done.to_owned() } else { format!("{done} already") }, changed)
+    }
+
     fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
         let epoch = self.epoch() + 1;
         self.engine.reset(pose_in_map.or(self.initial_pose));
+        self.engine.set_mode(self.first_mode);
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
         self.view.paused = before.paused;
@@ -508,12 +557,15 @@ impl Mapper {
         self.view.first_epoch = epoch;
         self.gauges.matched.clear();
         self.gauges.weakness.clear();
+        self.show_start();
         self.renew_estimate(None);
         let at = match pose_in_map.or(self.initial_pose) {
             Some(pose) => format!("at {}", in_words(pose)),
+            None if self.view.map.is_some() => "where it fits".to_owned(),
             None => "where odometry says".to_owned(),
         };
-        (format!("map and path are forgotten; the next scan begins a new map {at}"), true)
+        let begins = if self.view.map.is_some() { "in the map to start from" } else { "a new map" };
+        (format!("map and path are forgotten; the next scan begins {begins} {at}"), true)
     }
 
     fn set_pose(&mut self, pose_in_map: Pose2) -> (String, bool) {

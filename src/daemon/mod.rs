@@ -63,7 +63,7 @@ use self::snapshot::{MapVersion, Snapshot, State};
 use self::status::{Shared, Status, StatusSource};
 use crate::clock;
 use crate::config::Config;
-use crate::slam::gmapping::ThreadsError;
+use crate::starting::StartError;
 
 /// At the end, what waits in the mailbox is worked off for this long.
 const DRAIN: Duration = Duration::from_millis(1200);
@@ -109,9 +109,9 @@ pub enum DaemonError {
     /// What `record` asks for cannot be done.
     #[error("record: {0}")]
     Record(#[from] RecorderError),
-    /// The filter's threads do not start.
+    /// The filter does not start.
     #[error(transparent)]
-    Threads(#[from] ThreadsError),
+    Start(#[from] StartError),
     /// The state cannot be kept.
     #[error("state: {0}")]
     Checkpoints(#[from] CheckpointsError),
@@ -486,8 +486,13 @@ async fn log_changes(source: Arc<StatusSource>) {
         let (state, detail) = source.state();
         if last.replace(state) != Some(state) {
             match state {
-                State::Mapping | State::Paused => tracing::info!(?state, "{detail}"),
-                State::WaitingForScans | State::WaitingForOdometry | State::Degraded => {
+                State::Mapping | State::Localizing | State::Paused => {
+                    tracing::info!(?state, "{detail}")
+                }
+                State::WaitingForScans
+                | State::WaitingForOdometry
+                | State::NotLocalized
+                | State::Degraded => {
                     tracing::warn!(?state, "{detail}");
                 }
             }

@@ -13,6 +13,7 @@ use super::tiles::TilesQuestion;
 use crate::config::CommandName;
 use crate::map::region::{Layer, Window};
 use crate::map::tiles::TileIndex;
+use crate::slam::known_map::Mode;
 use crate::slam::pose::{Point2, Pose2, Stamp, wrap_angle};
 
 /// Columns of a map drawn with characters, unless asked otherwise.
@@ -64,6 +65,8 @@ pub enum Topic {
     Resume,
     /// Say where the robot is.
     InitialPose,
+    /// Let scans enter the map, or freeze it.
+    Mode,
     /// Write the map to files.
     Save,
     /// Write the state, to go on from.
@@ -72,7 +75,7 @@ pub enum Topic {
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -86,6 +89,7 @@ impl Topic {
         Self::Pause,
         Self::Resume,
         Self::InitialPose,
+        Self::Mode,
         Self::Save,
         Self::Checkpoint,
     ];
@@ -107,6 +111,7 @@ impl Topic {
             Self::Pause => "slam/cmd/pause",
             Self::Resume => "slam/cmd/resume",
             Self::InitialPose => "slam/cmd/initial_pose",
+            Self::Mode => "slam/cmd/mode",
             Self::Save => "slam/cmd/save",
             Self::Checkpoint => "slam/cmd/checkpoint",
         }
@@ -121,6 +126,7 @@ impl Topic {
             Self::Resume => Some(CommandName::Resume),
             Self::InitialPose => Some(CommandName::InitialPose),
             Self::Save => Some(CommandName::Save),
+            Self::Mode => Some(CommandName::Mode),
             Self::Checkpoint => Some(CommandName::Checkpoint),
             Self::Map
             | Self::DynamicMap
@@ -171,6 +177,11 @@ impl Topic {
                 let pose = of(&["x", "y", "yaw"])?.pose()?;
                 Question::InitialPose(pose.ok_or(SelectorError::NoPose)?)
             }
+            Self::Mode => {
+                let modes = [("mapping", Mode::Mapping), ("localization", Mode::Localization)];
+                let mode = of(&["mode"])?.choice("mode", &modes)?;
+                Question::Mode(mode.ok_or(SelectorError::NoMode)?)
+            }
             Self::Save => {
                 let parameters = of(&["name"])?;
                 let name = parameters.get("name").map(SaveName::parse).transpose()?;
@@ -217,6 +228,8 @@ pub enum Question {
     Resume,
     /// The base is at this pose in `map`.
     InitialPose(Pose2),
+    /// Scans enter the map, or do not.
+    Mode(Mode),
     /// Write the map to files of this name.
     Save(SaveName),
     /// Write the state, to go on from.
@@ -341,6 +354,9 @@ pub enum SelectorError {
     /// No pose where one is needed.
     #[error("a pose is needed: x and y in metres and yaw in radians, as in x=1.5;y=-2;yaw=0.5")]
     NoPose,
+    /// No mode where one is needed.
+    #[error("a mode is needed: mode=mapping or mode=localization")]
+    NoMode,
     /// No name for files.
     #[error(transparent)]
     Name(#[from] NameError),

@@ -7,6 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::ledger::Ledger;
 use crate::slam::grid::occupancy::{OccupancyMap, OccupiedThreshold};
+use crate::slam::known_map::Mode;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::update::ScanReport;
@@ -25,7 +26,9 @@ pub struct Snapshot {
     pub resamples: u64,
     /// Whether scans are taken.
     pub paused: bool,
-    /// The map, `None` before the first scan and after a reset; often older than the estimate.
+    /// Whether they enter the map.
+    pub mode: Mode,
+    /// The map; without a map to start from `None` before the first scan and after a reset; often older than the estimate.
     pub map: Option<Arc<MapVersion>>,
 }
 
@@ -82,8 +85,12 @@ pub enum State {
     WaitingForScans,
     /// Scans come, and no odometry for them.
     WaitingForOdometry,
+    /// Scans come, and where in the known map they were taken cannot be told.
+    NotLocalized,
     /// Scans enter the map.
     Mapping,
+    /// Scans tell where the robot is in a map that stays as it is.
+    Localizing,
     /// Scans come, and many of them are lost or do not match.
     Degraded,
     /// By command.

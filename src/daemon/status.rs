@@ -19,6 +19,7 @@ use super::snapshot::{MapVersion, Snapshot, State};
 use super::synchronizer::Channel;
 use crate::clock;
 use crate::config::{EngineKind, RawConfig};
+use crate::slam::known_map::Mode;
 use crate::slam::pose::Pose2;
 use crate::slam::scan::LaserMount;
 use crate::slam::update::WeakDirection;
@@ -40,6 +41,8 @@ pub struct Status {
     pub state: State,
     /// In a sentence, with what to do where something is wrong.
     pub detail: String,
+    /// Whether scans enter the map.
+    pub mode: Mode,
     /// The pose of the base in `map`.
     pub pose_in_map: Pose2,
     /// How the laser of the last scan sits on the base; `null` before the first.
@@ -213,6 +216,7 @@ impl StatusSource {
             version: env!("CARGO_PKG_VERSION"),
             uptime_s: self.uptime_s(),
             state,
+            mode: snapshot.mode,
             detail,
             pose_in_map: snapshot.estimate.pose_in_map,
             laser: gauges.laser,

@@ -2,6 +2,7 @@
 //! drawn with characters, as JSON, and as a hash.
 
 mod bounds;
+mod file;
 mod hash;
 mod json;
 pub mod mirror;
@@ -11,6 +12,7 @@ pub mod region;
 mod text;
 pub mod tiles;
 
+pub use file::{MapFileError, read};
 pub use hash::content_hash;
 pub use json::{NotAMap, json, parse_json};
 pub use pgm::{pgm, yaml};

@@ -104,6 +104,8 @@ pub struct Counts {
     pub no_usable_beams: u64,
     /// Readings whose odometry is not finite.
     pub bad_odometry: u64,
+    /// Scans whose place in the known map cannot be told.
+    pub not_localized: u64,
     /// Scans whose angles or limits are lost in a message.
     pub bad_geometry: u64,
     /// Readings without a scan.
@@ -124,6 +126,7 @@ impl Counts {
             Verdict::Throttled => &mut self.throttled,
             Verdict::NoUsableBeams => &mut self.no_usable_beams,
             Verdict::BadOdometry => &mut self.bad_odometry,
+            Verdict::NotLocalized => &mut self.not_localized,
             Verdict::BadGeometry => &mut self.bad_geometry,
             Verdict::OdometryOnly => &mut self.odometry_only,
         };

@@ -1,15 +1,19 @@
 //! The mapping systems, one of which runs.
 
+use std::sync::Arc;
+
 use nalgebra::Matrix3;
 
 use super::gmapping::{GMapping, Parameters, ThreadsError};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::TileCounts;
 use super::hector::{self, Hector};
+use super::known_map::{KnownMap, Mode};
 use super::known_poses::{self, KnownPoses};
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
+use super::search::NotLocalized;
 use super::state::{EngineState, StateError};
 use super::update::{OdometryUpdate, OnPhase, ScanReading, ScanUpdate, SkipReason};
 
@@ -88,6 +92,54 @@ impl Engine {
             (Self::GMapping(_) | Self::Hector(_) | Self::KnownPoses(_), _) => {
                 Err(StateError::OtherEngine)
             }
+        }
+    }
+
+    /// An engine that begins with a known map. Where no initial pose is set, that of the first scan
+    /// is searched for. Mapping along given poses takes no map.
+    ///
+    /// # Errors
+    /// When the threads cannot be started.
+    pub fn from_map(
+        parameters: EngineParameters,
+        threads: usize,
+        known: Arc<KnownMap>,
+    ) -> Result<Self, ThreadsError> {
+        let mut engine = Self::new(parameters, threads)?;
+        match &mut engine {
+            Self::GMapping(filter) => filter.begin_on(known),
+            Self::Hector(hector) => hector.begin_on(known),
+            Self::KnownPoses(_) => {}
+        }
+        Ok(engine)
+    }
+
+    /// Whether scans enter the map from now on; where poses are given, this has no effect.
+    pub fn set_mode(&mut self, mode: Mode) {
+        match self {
+            Self::GMapping(filter) => filter.set_mode(mode),
+            Self::Hector(hector) => hector.set_mode(mode),
+            Self::KnownPoses(_) => {}
+        }
+    }
+
+    /// Whether scans enter the map.
+    #[must_use]
+    pub const fn mode(&self) -> Mode {
+        match self {
+            Self::GMapping(filter) => filter.mode(),
+            Self::Hector(hector) => hector.mode(),
+            Self::KnownPoses(_) => Mode::Mapping,
+        }
+    }
+
+    /// Why the last scan was [`SkipReason::NotLocalized`], until one is localized.
+    #[must_use]
+    pub const fn obstacle(&self) -> Option<&NotLocalized> {
+        match self {
+            Self::GMapping(filter) => filter.obstacle(),
+            Self::Hector(hector) => hector.obstacle(),
+            Self::KnownPoses(_) => None,
         }
     }
 

@@ -51,7 +51,7 @@ pub struct ScanReport {
     pub entropy: f64,
     /// Whether particles were drawn anew.
     pub resampled: bool,
-    /// Whether the scan entered the map; GMapping enters each that it processes.
+    /// Whether the scan entered the map; GMapping enters each that it processes while it maps.
     pub registered: bool,
     /// The motion that the scan tells nothing about, if there is one and the engine looks for it.
     pub weak_direction: Option<WeakDirection>,
@@ -81,6 +81,8 @@ pub enum SkipReason {
     NoUsableBeams,
     /// The odometry pose is not usable, or there is none and the engine needs one.
     BadOdometry,
+    /// Where in the known map it was taken cannot be told.
+    NotLocalized,
 }
 
 /// The parts of processing a scan, in order; reported when each ends. An engine may lack some.

@@ -18,6 +18,7 @@ use gmapd::daemon::status::{FilterStatus, Status};
 use gmapd::ros;
 use gmapd::slam::gmapping::{GMapping, ScanReport, ScanUpdate};
 use gmapd::slam::grid::occupancy::OccupiedThreshold;
+use gmapd::slam::known_map::Mode;
 use gmapd::slam::pose::{Point2, Pose2};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::{broadcast, mpsc, watch};
@@ -102,6 +103,7 @@ pub(crate) fn nothing() -> Snapshot {
         milliseconds_per_scan: None,
         resamples: 0,
         paused: false,
+        mode: Mode::Mapping,
         map: None,
     }
 }
@@ -111,6 +113,7 @@ fn status() -> Status {
         version: "1.2.3",
         engine: EngineKind::Gmapping,
         links: LinksStatus::default(),
+        mode: Mode::Mapping,
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
         detail: "odometry is missing".to_owned(),

@@ -28,7 +28,7 @@ use thiserror::Error;
 use self::output_map::OutputMap;
 pub use self::parameters::{MapParameters, Parameters};
 pub use self::particle::Particle;
-use self::particle::{ScanMatcher, Step};
+use self::particle::{ParticleMap, ScanMatcher, Step};
 use self::prepared_scan::PreparedScan;
 use self::random::{Purpose, Streams};
 pub use self::resampling::{WeightSmoothing, Weighting};
@@ -36,10 +36,12 @@ pub use self::scan_matcher::{MatcherKind, MatcherParameters};
 use self::trajectory::{NodeId, TrajectoryTree};
 use super::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::TileCounts;
+use super::known_map::{KnownMap, Mode};
 use super::odometry::Motion;
 pub use super::odometry::{JumpGuard, JumpPolicy};
 use super::path::Path;
 use super::pose::{Pose2, Stamp, wrap_angle};
+use super::search::NotLocalized;
 pub use super::update::{
     OdometryUpdate, OnPhase, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason,
 };
@@ -85,6 +87,19 @@ pub struct GMapping {
     /// Of the processed scans after those.
     stamps: VecDeque<Stamp>,
     scans_seen: usize,
+    mode: Mode,
+    beginning: Beginning,
+}
+
+/// What the filter begins with, beside its parameters.
+#[derive(Debug, Clone, Default)]
+struct Beginning {
+    /// The map that is known before the first scan.
+    known: Option<Arc<KnownMap>>,
+    /// The same as particles have it.
+    map: ParticleMap,
+    /// Why the last scan could not be the first one.
+    obstacle: Option<NotLocalized>,
 }
 
 /// What odometry said last, and since the last processed scan.
@@ -122,8 +137,52 @@ impl GMapping {
             settled: Path::default(),
             stamps: VecDeque::new(),
             scans_seen: 0,
+            mode: Mode::Mapping,
+            beginning: Beginning::default(),
             parameters,
         })
+    }
+
+    /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
+    /// is searched for.
+    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
+        self.output = OutputMap::on(known.occupancy());
+        let map = self.matcher.map_of(&known);
+        self.beginning = Beginning { known: Some(known), map, obstacle: None };
+    }
+
+    /// Whether scans enter the map from now on.
+    ///
+    /// When they do no more, all particles go on from the best one's pose and share its map.
+    pub fn set_mode(&mut self, mode: Mode) {
+        if self.mode == Mode::Mapping && mode == Mode::Localization {
+            self.unite();
+        }
+        self.mode = mode;
+    }
+
+    /// Whether scans enter the map.
+    #[must_use]
+    pub const fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Why no scan could be the first one yet.
+    #[must_use]
+    pub const fn obstacle(&self) -> Option<&NotLocalized> {
+        self.beginning.obstacle.as_ref()
+    }
+
+    /// All particles become the best one.
+    fn unite(&mut self) {
+        let Some(best) = self.best().cloned() else { return };
+        let count = self.particles.len();
+        (0..count).for_each(|_| self.tree.hold(best.node));
+        let likeliest = Particle { log_weight: 0.0, ..best };
+        for particle in std::mem::replace(&mut self.particles, vec![likeliest; count]) {
+            self.tree.release(particle.node);
+        }
+        self.settle();
     }
 
     /// Forgets map and trajectories, as if nothing had been read: the next scan is the first, at
@@ -138,6 +197,9 @@ impl GMapping {
         self.settled = Path::default();
         self.stamps.clear();
         self.scans_seen = 0;
+        if let Some(known) = self.beginning.known.take() {
+            self.begin_on(known);
+        }
     }
 
     /// Says where the base is in `map`: before the first scan, where the map begins; later, all
@@ -177,6 +239,11 @@ impl GMapping {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
+        if self.particles.is_empty()
+            && let Err(reason) = self.locate(&scan)
+        {
+            return ScanUpdate::Skipped(reason);
+        }
         self.stamps.push_back(reading.scan.stamp);
         let odom_from_base = reading.odom_from_base;
         // On one of the pool's threads, so that only the others have to be woken.
@@ -195,7 +262,7 @@ impl GMapping {
     ) -> ScanReport {
         let motion = std::mem::take(&mut self.odometry.since_processed);
         if self.particles.is_empty() {
-            self.begin(odom_from_base);
+            self.begin(scan, odom_from_base);
         } else {
             self.match_particles(scan, motion);
         }
@@ -227,12 +294,37 @@ impl GMapping {
         if scan.hits.is_empty() { Err(SkipReason::NoUsableBeams) } else { Ok(scan) }
     }
 
-    /// All particles start alike; without an initial pose, `map` is `odom` at the first scan.
-    fn begin(&mut self, odom_from_base: Pose2) {
-        let pose = self.parameters.initial_pose.unwrap_or(odom_from_base);
+    /// Searches the known map, if there is one, for where the first scan was taken.
+    fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
+        let Some(known) = &self.beginning.known else { return Ok(()) };
+        if self.parameters.initial_pose.is_some() {
+            return Ok(());
+        }
+        match known.find(&scan.outline, self.pool.as_deref()) {
+            Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
+            Err(obstacle) => {
+                self.beginning.obstacle = Some(obstacle);
+                return Err(SkipReason::NotLocalized);
+            }
+        }
+        Ok(())
+    }
+
+    /// All particles start alike; without an initial pose, `map` is `odom` at the first scan. In a
+    /// known map, the scan is matched first.
+    fn begin(&mut self, scan: &PreparedScan, odom_from_base: Pose2) {
+        let mut pose = self.parameters.initial_pose.unwrap_or(odom_from_base);
+        let map = self.beginning.map.clone();
+        if self.beginning.known.is_some() {
+            let found = self.matcher.run(&map, scan, pose);
+            if found.score > self.parameters.matcher.minimum_score {
+                pose = found.pose_in_map;
+            }
+            self.beginning.obstacle = None;
+        }
         let count = self.parameters.particles.max(1);
         let root = self.tree.append(None, pose);
-        self.particles = vec![Particle::new(pose, root); count];
+        self.particles = vec![Particle::new(pose, root, map); count];
         (1..count).for_each(|_| self.tree.hold(root));
     }
 
@@ -269,7 +361,7 @@ impl GMapping {
             effective_sample_size,
             entropy: resampling::entropy(&weights),
             resampled: effective_sample_size < threshold || disputed > HISTORY + HISTORY / 4,
-            registered: true,
+            registered: self.mode == Mode::Mapping,
             weak_direction: None,
         };
         if report.resampled {
@@ -292,9 +384,13 @@ impl GMapping {
     }
 
     /// Enters the scan in each particle's map, and in the output map at the same time if there are
-    /// threads.
+    /// threads; while the map is frozen, in none.
     fn register(&mut self, scan: &PreparedScan, on_phase: OnPhase<'_>) {
         let Some(best) = self.best().map(|particle| particle.node) else { return };
+        if self.mode == Mode::Localization {
+            self.output.follow(&mut self.tree, best);
+            return on_phase(Phase::Register);
+        }
         let outline = scan.outline.clone();
         let Self { matcher, particles, output, tree, pool, .. } = self;
         let mut register = || {

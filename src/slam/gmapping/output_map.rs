@@ -25,7 +25,12 @@ impl OutputMap {
     /// An empty map of cells of `resolution` metres.
     #[must_use]
     pub fn new(resolution: f64) -> Self {
-        let map = OccupancyMap::new(resolution);
+        Self::on(OccupancyMap::new(resolution))
+    }
+
+    /// A map to which scans are added.
+    #[must_use]
+    pub const fn on(map: OccupancyMap) -> Self {
         Self { map, node: None, scans: VecDeque::new(), first_depth: 0, corrections: 0 }
     }
 
@@ -55,6 +60,18 @@ impl OutputMap {
             let scan = &self.scans[(tree.depth(id) - self.first_depth) as usize];
             self.map.add(scan, tree.pose(id));
         }
+        tree.hold(node);
+        if let Some(old) = self.node.replace(node) {
+            tree.release(old);
+        }
+    }
+
+    /// Moves to the trajectory that ends at `node`, whose newest scan enters no map; the map stays
+    /// as it is.
+    ///
+    /// All particles share the map's scans: with the best of them, only poses change.
+    pub fn follow(&mut self, tree: &mut TrajectoryTree, node: NodeId) {
+        self.scans.push_back(Arc::default());
         tree.hold(node);
         if let Some(old) = self.node.replace(node) {
             tree.release(old);

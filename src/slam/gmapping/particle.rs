@@ -2,8 +2,9 @@
 
 use nalgebra::Matrix3;
 
-use super::super::grid::hit_map::HitMap;
+use super::super::grid::hit_map::{HitMap, add_hit};
 use super::super::grid::likelihood_field::LikelihoodField;
+use super::super::known_map::KnownMap;
 use super::super::odometry::{Motion, MotionNoise};
 use super::super::pose::{Pose2, wrap_angle};
 use super::compat::CompatMatcher;
@@ -65,12 +66,12 @@ pub(super) struct Step<'a> {
 }
 
 impl Particle {
-    /// A particle at the start, with an empty map.
-    pub(super) fn new(pose_in_map: Pose2, node: NodeId) -> Self {
+    /// A particle at the start, with the map that is known there.
+    pub(super) fn new(pose_in_map: Pose2, node: NodeId, map: ParticleMap) -> Self {
         Self {
             pose_in_map,
             covariance: Matrix3::zeros(),
-            map: ParticleMap::default(),
+            map,
             log_weight: 0.0,
             total_log_weight: 0.0,
             node,
@@ -144,7 +145,22 @@ impl ScanMatcher {
         }
     }
 
-    fn run(&self, map: &ParticleMap, scan: &PreparedScan, start: Pose2) -> Match {
+    /// A known map as particles have it.
+    pub(super) fn map_of(&self, known: &KnownMap) -> ParticleMap {
+        let (mut map, first) = (ParticleMap::default(), known.first());
+        match self {
+            Self::Field(matcher) => {
+                let obstacles = known.obstacles().map(|[x, y]| (x as f32, y as f32));
+                matcher.enter(&mut map.field, first, &obstacles.collect());
+            }
+            Self::Compat(_) => {
+                known.obstacles().for_each(|point| add_hit(&mut map.hits, first, point));
+            }
+        }
+        map
+    }
+
+    pub(super) fn run(&self, map: &ParticleMap, scan: &PreparedScan, start: Pose2) -> Match {
         match self {
             Self::Field(matcher) => matcher.run(&map.field, scan, start),
             Self::Compat(matcher) => matcher.run(&map.hits, scan, start),

@@ -151,6 +151,11 @@ impl FieldMatcher {
         self.kernel.insert(field, origin, &scan.surfaces, pose);
     }
 
+    /// Enters points, in cells from the lower-left corner of `origin`, into `field`.
+    pub fn enter(&self, field: &mut LikelihoodField, origin: Cell, points: &Points) {
+        self.kernel.insert(field, origin, points, WindowPose::new(0.0, 0.0, 0.0));
+    }
+
     /// A sweep of headings, then hill climbing along the map's axes and the heading.
     fn climb(&self, window: &Window<'_>, points: &Points, origin: WindowPose) -> WindowPose {
         let mut best = (window.score(points, origin), origin);

@@ -11,6 +11,7 @@ use super::super::grid::likelihood_field::LikelihoodField;
 use super::super::grid::occupancy::{Count, OccupancyMap, ScanOutline};
 use super::super::grid::tile_map::TileMap;
 use super::super::grid::tile_map::saved::SavedMaps;
+use super::super::known_map::Mode;
 use super::super::path::Path;
 use super::super::pose::{Pose2, Stamp};
 use super::super::state::{StateError, ensure, ensure_figures, ensure_poses};
@@ -35,6 +36,7 @@ pub struct GMappingState {
     settled: Path,
     stamps: VecDeque<Stamp>,
     scans_seen: usize,
+    mode: Mode,
 }
 
 /// A particle without its map.
@@ -75,6 +77,7 @@ impl GMapping {
             settled: self.settled.clone(),
             stamps: self.stamps.clone(),
             scans_seen: self.scans_seen,
+            mode: self.mode,
         }
     }
 
@@ -98,6 +101,7 @@ impl GMapping {
         self.settled = state.settled;
         self.stamps = state.stamps;
         self.scans_seen = state.scans_seen;
+        self.mode = state.mode;
         Ok(())
     }
 }

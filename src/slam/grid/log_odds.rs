@@ -15,6 +15,8 @@ use super::tile_map::{TileKey, TileMap, index_in_tile};
 const STEPS: f64 = 4096.0;
 /// Log-odds stay within this, nats: p from 0.018 to 0.982.
 pub const CLAMP: f64 = 4.0;
+/// Of a cell that is known from a map: 3 nats, p = 0.95 or 0.05.
+const KNOWN: i16 = (3.0 * STEPS) as i16;
 const LIMIT: i16 = (CLAMP * STEPS) as i16;
 
 /// ln(p / (1 - p)) in steps of 1/4096; 0 is unknown.
@@ -159,6 +161,16 @@ impl LogOddsMap {
                 }
             }
         });
+    }
+
+    /// Takes a cell as known: occupied if any part of it is said to be, else free.
+    pub fn know(&mut self, cell: Cell, occupied: bool) {
+        let value = self.cells.get_mut(cell);
+        if occupied {
+            *value = LogOdds(KNOWN);
+        } else if value.sign() <= 0 {
+            *value = LogOdds(-KNOWN);
+        }
     }
 
     /// The log-odds at a point of the map.

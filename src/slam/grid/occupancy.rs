@@ -142,6 +142,21 @@ impl OccupancyMap {
         Self { resolution, counts, scratch: Scratch::default() }
     }
 
+    /// A map whose cells count as seen `visits` times, with hits as the grid's values say; `first`
+    /// is the cell that the grid's first one goes to.
+    #[must_use]
+    pub fn of_grid(grid: &OccupancyGrid, first: Cell, visits: u32) -> Self {
+        let mut map = Self::new(grid.resolution);
+        for (iy, row) in (first.iy..).zip(grid.cells.chunks_exact(grid.width.max(1))) {
+            for (ix, value) in (first.ix..).zip(row).filter(|(_, value)| **value >= 0) {
+                let share = f64::from(*value) / 100.0;
+                let hits = libm::round(share * f64::from(visits)) as u32;
+                *map.counts.get_mut(Cell::new(ix, iy)) = Count { hits, visits };
+            }
+        }
+        map
+    }
+
     /// Metres a cell.
     #[must_use]
     pub const fn resolution(&self) -> f64 {

@@ -15,6 +15,8 @@ pub mod pyramid;
 pub mod state;
 pub mod weakness;
 
+use std::sync::Arc;
+
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
@@ -26,13 +28,18 @@ use self::pyramid::Pyramid;
 use super::engine::Sweep;
 use super::grid::occupancy::{Count, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::{TileCounts, TileKey};
+use super::known_map::{KnownMap, Mode};
 use super::odometry::Motion;
 use super::path::Path;
 use super::pose::{Pose2, Stamp};
+use super::search::NotLocalized;
 use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, SkipReason};
 
 /// How much of the usual score each scan renews.
 const RENEWAL: f64 = 0.1;
+
+/// How surely an initial pose in a known map is given or found: standard deviations, m and rad.
+const INITIAL: [f64; 2] = [0.1, 0.05];
 
 /// The engine.
 #[derive(Debug, Clone)]
@@ -46,6 +53,17 @@ pub struct Hector {
     path: Path,
     output: Output,
     scans_seen: usize,
+    mode: Mode,
+    beginning: Beginning,
+}
+
+/// What the engine begins with, beside its parameters.
+#[derive(Debug, Clone, Default)]
+struct Beginning {
+    /// The map that is known before the first scan.
+    known: Option<Arc<KnownMap>>,
+    /// Why the last scan could not be the first one.
+    obstacle: Option<NotLocalized>,
 }
 
 /// Where the robot was at the last processed scan.
@@ -82,15 +100,44 @@ impl Hector {
             path: Path::default(),
             output: Output::new(parameters.resolution),
             scans_seen: 0,
+            mode: Mode::Mapping,
+            beginning: Beginning::default(),
             parameters,
         }
+    }
+
+    /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
+    /// is searched for.
+    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
+        let Self { pyramid, output, .. } = self;
+        pyramid.enter(known.cells(), |tile| output.stale.push(tile));
+        self.beginning = Beginning { known: Some(known), obstacle: None };
+    }
+
+    /// Whether scans enter the map from now on.
+    pub const fn set_mode(&mut self, mode: Mode) {
+        self.mode = mode;
+    }
+
+    /// Whether scans enter the map.
+    #[must_use]
+    pub const fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Why no scan could be the first one yet.
+    #[must_use]
+    pub const fn obstacle(&self) -> Option<&NotLocalized> {
+        self.beginning.obstacle.as_ref()
     }
 
     /// Forgets map and path, as if nothing had been read: the next scan is the first, at
     /// `initial_pose` in `map`, or where odometry says.
     pub fn reset(&mut self, initial_pose: Option<Pose2>) {
         let parameters = Parameters { initial_pose, ..self.parameters.clone() };
-        *self = Self::new(parameters);
+        let (mode, known) = (self.mode, self.beginning.known.take());
+        *self = Self { mode, ..Self::new(parameters) };
+        known.into_iter().for_each(|known| self.begin_on(known));
     }
 
     /// Says where the base is in `map`: before the first scan, where the map begins; later, the
@@ -129,10 +176,15 @@ impl Hector {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
+        if self.state.is_none()
+            && let Err(reason) = self.locate(&scan)
+        {
+            return ScanUpdate::Skipped(reason);
+        }
         let placed = self.place(&scan, sweep);
         on_phase(Phase::Match);
         on_phase(Phase::Resample);
-        let registered = self.advance(sweep, &placed);
+        let registered = self.advance(sweep, &placed) && self.mode == Mode::Mapping;
         if registered {
             let Self { pyramid, output, .. } = self;
             pyramid.add(&scan, placed.pose_in_map, |tile| output.stale.push(tile));
@@ -170,10 +222,31 @@ impl Hector {
     fn place(&self, scan: &PreparedScan, sweep: &Sweep<'_>) -> Placed {
         let Some(state) = &self.state else {
             let odometry = sweep.odom_from_base.unwrap_or_default();
-            return Placed::first(scan, self.parameters.initial_pose.unwrap_or(odometry));
+            let pose = self.parameters.initial_pose.unwrap_or(odometry);
+            if self.beginning.known.is_none() {
+                return Placed::first(scan, pose);
+            }
+            let prediction = Prediction::within(pose, INITIAL);
+            return matcher::place(&self.pyramid, scan, &prediction, 1.0);
         };
         let prediction = self.predict(state, sweep);
         matcher::place(&self.pyramid, scan, &prediction, state.usual_score)
+    }
+
+    /// Searches the known map, if there is one, for where the first scan was taken.
+    fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
+        let Some(known) = &self.beginning.known else { return Ok(()) };
+        if self.parameters.initial_pose.is_none() {
+            match known.find(&scan.outline, None) {
+                Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
+                Err(obstacle) => {
+                    self.beginning.obstacle = Some(obstacle);
+                    return Err(SkipReason::NotLocalized);
+                }
+            }
+        }
+        self.beginning.obstacle = None;
+        Ok(())
     }
 
     fn predict(&self, state: &State, sweep: &Sweep<'_>) -> Prediction {

@@ -56,6 +56,13 @@ impl Prediction {
         Self::after(from, increment, [distance, distance, angle])
     }
 
+    /// Somewhere around a pose: standard deviations, m and rad.
+    #[must_use]
+    pub fn within(pose_in_map: Pose2, [distance, angle]: [f64; 2]) -> Self {
+        let variances = Vector3::new(distance * distance, distance * distance, angle * angle);
+        Self { pose_in_map, covariance: Matrix3::from_diagonal(&variances) }
+    }
+
     fn after((pose, covariance): (Pose2, Matrix3<f64>), step: Pose2, deviations: [f64; 3]) -> Self {
         let pose_in_map = pose * step;
         let (dx, dy) = (pose_in_map.x - pose.x, pose_in_map.y - pose.y);

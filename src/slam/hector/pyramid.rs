@@ -1,5 +1,6 @@
 //! Maps of the same world in cells of growing size, each updated with every scan that enters.
 
+use super::super::grid::Cell;
 use super::super::grid::log_odds::{Evidence, LogOdds, LogOddsMap, Probabilities};
 use super::super::grid::tile_map::{TileCounts, TileKey, TileMap};
 use super::super::pose::Pose2;
@@ -63,6 +64,21 @@ impl Pyramid {
                     touched(tile);
                 }
             });
+        }
+    }
+
+    /// Enters cells of the finest map that are known, with whether an obstacle is there; `touched`
+    /// is called with their tiles. In coarser maps an obstacle counts more than free space.
+    pub fn enter(
+        &mut self,
+        cells: impl Iterator<Item = (Cell, bool)>,
+        mut touched: impl FnMut(TileKey),
+    ) {
+        for (cell, occupied) in cells {
+            touched(TileKey::containing(cell));
+            for (level, map) in self.maps.iter_mut().enumerate() {
+                map.know(Cell::new(cell.ix >> level, cell.iy >> level), occupied);
+            }
         }
     }
 

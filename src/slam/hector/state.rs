@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::super::grid::log_odds::LogOdds;
 use super::super::grid::tile_map::saved::SavedMaps;
+use super::super::known_map::Mode;
 use super::super::path::Path;
 use super::super::pose::Pose2;
 use super::super::state::{StateError, ensure_figures, ensure_poses};
@@ -18,6 +19,7 @@ pub struct HectorState {
     odometry: Odometry,
     path: Path,
     scans_seen: usize,
+    mode: Mode,
 }
 
 impl Hector {
@@ -31,6 +33,7 @@ impl Hector {
             odometry: self.odometry.clone(),
             path: self.path.clone(),
             scans_seen: self.scans_seen,
+            mode: self.mode,
         }
     }
 
@@ -56,6 +59,7 @@ impl Hector {
         self.odometry = state.odometry;
         self.path = state.path;
         self.scans_seen = state.scans_seen;
+        self.mode = state.mode;
         Ok(())
     }
 }
