@@ -68,6 +68,9 @@ use crate::starting::StartError;
 /// At the end, what waits in the mailbox is worked off for this long.
 const DRAIN: Duration = Duration::from_millis(1200);
 
+/// And the state is written for this long: a busy disk takes its time.
+const LAST_CHECKPOINT: Duration = Duration::from_secs(10);
+
 /// How long anything else may take at the end.
 const CLOSE: Duration = Duration::from_millis(200);
 
@@ -350,6 +353,7 @@ impl Daemon {
         self.inbox.close();
         tokio::time::timeout(CLOSE, &mut self.decoder).await.ok();
         self.mailbox.close(deadline);
+        let deadline = deadline + self.status.time_to_write();
         if tokio::time::timeout_at(deadline.into(), self.mapper_ended()).await.is_err() {
             tracing::warn!("the filter did not end in time; its last scans are lost");
         }

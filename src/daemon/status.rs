@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use tokio::sync::watch;
 
+use super::LAST_CHECKPOINT;
 use super::checkpointing::{CheckpointStatus, SharedStatus};
 use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
@@ -183,6 +184,11 @@ impl StatusSource {
     pub fn state(&self) -> (State, String) {
         let (snapshot, gauges) = self.present();
         self.judge(&self.inputs(&gauges), &snapshot, &gauges)
+    }
+
+    /// How long the last state may take to be written.
+    pub(super) const fn time_to_write(&self) -> Duration {
+        if self.checkpoints.is_some() { LAST_CHECKPOINT } else { Duration::ZERO }
     }
 
     fn present(&self) -> (Arc<Snapshot>, Gauges) {

@@ -55,6 +55,7 @@ pub enum StateError {
 ///
 /// # Errors
 /// Names the parts.
+#[expect(clippy::fn_params_excessive_bools, reason = "it is a condition, as of an assertion")]
 pub fn ensure(fits: bool, parts: &'static str) -> Result<(), StateError> {
     if fits { Ok(()) } else { Err(StateError::Unsound(parts)) }
 }
