@@ -14,12 +14,14 @@
 //! - [`doctor`]: what is wrong with a robot's scans and odometry;
 //! - [`map`]: maps as pictures and map_server files;
 //! - [`evaluation`]: how far a trajectory is from the truth;
+//! - [`checkpoint`]: the state in files, and what is good of them;
 //! - [`given_poses`]: poses of a file, to map along;
 //! - [`daemon`]: live mapping on a Zenoh mesh;
 //! - [`client`]: for programs on the mesh that follow robots;
 //! - [`recorded`]: recorded messages in the order in which the daemon takes them;
 //! - [`files`], [`clock`], [`statistics`]: whole files, clocks, percentiles.
 
+pub mod checkpoint;
 pub mod client;
 pub mod clock;
 pub mod config;

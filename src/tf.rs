@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::slam::pose::Stamp;
@@ -111,7 +112,7 @@ pub struct TfCounts {
 }
 
 /// The frames of a robot over the last seconds.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TfBuffer {
     /// By child.
     links: BTreeMap<String, Link>,
@@ -122,13 +123,13 @@ pub struct TfBuffer {
     past: TimelineCounts,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Link {
     parent: String,
     place: Place,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum Place {
     Static(Isometry3<f64>),
     Dynamic(Timeline<Isometry3<f64>>),
@@ -174,6 +175,20 @@ impl TfBuffer {
                 restarts: 0,
             },
         }
+    }
+
+    /// Whether it is such as inserting makes it; of one that was read, nobody knows.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        let named = |name: &String| !name.is_empty() && name.len() <= LONGEST_NAME;
+        let ends = |frame: &String| self.chain(frame).nth(self.links.len() + 1).is_none();
+        let usable = |place: &Place| match place {
+            Place::Static(place) => place.to_homogeneous().iter().all(|n| n.is_finite()),
+            Place::Dynamic(timeline) => timeline.is_sound(),
+        };
+        self.links.len() <= MOST_FRAMES
+            && self.links.keys().all(|name| named(name) && ends(name))
+            && self.links.values().all(|link| named(&link.parent) && usable(&link.place))
     }
 
     /// Takes a transform. The latest message decides what a frame hangs from.

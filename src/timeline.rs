@@ -6,6 +6,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::slam::pose::{Pose2, Stamp, wrap_angle};
@@ -38,7 +39,7 @@ impl Interpolate for Pose2 {
 pub type OdometryBuffer = Timeline<Pose2>;
 
 /// The samples of the last seconds, in the order of their stamps.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Timeline<T> {
     samples: VecDeque<(Stamp, T)>,
     /// The last sample, if it came too late: one more such, and the clock was set back.
@@ -50,7 +51,7 @@ pub struct Timeline<T> {
 }
 
 /// What became of the samples that were not simply the newest.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TimelineCounts {
     /// Dropped: there was one with the same stamp.
     pub duplicates: u64,
@@ -143,6 +144,25 @@ impl<T: Interpolate> Timeline<T> {
             self.samples.pop_front();
             self.counts.crowded_out += 1;
         }
+    }
+
+    /// Whether it is such as inserting makes it; of one that was read, nobody knows.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        self.samples.iter().is_sorted_by(|a, b| a.0 < b.0)
+            && self.samples.len() <= self.most_samples
+            && (self.suspect.is_none() || self.counts.stale > 0)
+    }
+
+    /// Whether a sample with this stamp would come too long after newer ones.
+    #[must_use]
+    pub fn is_too_late(&self, stamp: Stamp) -> bool {
+        self.newest().is_some_and(|newest| newest.0.saturating_sub(stamp.0) > MOST_REORDERING)
+    }
+
+    /// Counts a sample that came before already and is not looked at.
+    pub fn count_duplicate(&mut self) {
+        self.counts.duplicates += 1;
     }
 
     /// The value at a stamp, between the samples before and after it.

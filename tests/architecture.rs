@@ -66,8 +66,9 @@ const NOT_REPEATABLE: [&str; 13] = [
 ];
 
 /// Each module of the library, and the modules it may use.
-const MAY_USE: [(&str, &[&str]); 20] = [
+const MAY_USE: [(&str, &[&str]); 21] = [
     ("slam", &[]),
+    ("checkpoint", &["files", "slam"]),
     ("sim", &["slam"]),
     ("logs", &["ros", "slam"]),
     ("config", &["slam"]),
@@ -90,6 +91,7 @@ const MAY_USE: [(&str, &[&str]); 20] = [
     (
         "daemon",
         &[
+            "checkpoint",
             "clock",
             "config",
             "convert",
@@ -113,7 +115,8 @@ const MAY_USE: [(&str, &[&str]); 20] = [
 ];
 
 /// Words that a module must not have, beside those its row above rules out.
-const NEVER: [(&str, &[&str]); 10] = [
+const NEVER: [(&str, &[&str]); 11] = [
+    ("checkpoint", &["tokio", "zenoh", "slam::gmapping", "slam::grid"]),
     ("sim", &["tokio", "zenoh", "Instant", "SystemTime", "std::fs"]),
     // The vocabulary of poses and scans, and not the filter.
     ("logs", &["tokio", "zenoh", "slam::gmapping", "slam::grid"]),

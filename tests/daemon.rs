@@ -99,7 +99,11 @@ impl Moment {
 
 /// The first moments of a drive through a building.
 fn drive(moments: usize) -> Vec<Moment> {
-    let scenario = Scenario { beams: 120, ..Scenario::new(Place::Building, 3) };
+    drive_in(Place::Building, moments)
+}
+
+fn drive_in(place: Place, moments: usize) -> Vec<Moment> {
+    let scenario = Scenario { beams: 120, ..Scenario::new(place, 3) };
     let mut simulation = Simulation::new(&scenario).unwrap();
     simulation.lidar.mount = mount();
     simulation
@@ -593,6 +597,33 @@ async fn hector_maps_from_scans_alone_and_says_how_many_came_without_odometry() 
     assert_eq!(status.filter.scans_without_odometry, 6, "{}", status.detail);
     assert_eq!(status.filter.particles, 1);
     assert!(status.map.is_some_and(|map| map.known_area_m2 > 1.0));
+    rig.end().await;
+}
+
+/// In the middle of a straight corridor nothing tells how far along it the robot is.
+#[tokio::test(flavor = "multi_thread")]
+async fn hector_without_odometry_tells_its_transform_and_that_a_corridor_is_weak() {
+    let mut rig = Rig::mounted(&["engine=hector", "odometry_source=none"]).await;
+    let (sender, mut transforms) = tokio::sync::mpsc::unbounded_channel();
+    let told = move |sample: zenoh::sample::Sample| {
+        let message: ros::TfMessage = ros::decode(&sample.payload().to_bytes(), "").unwrap();
+        message.transforms.into_iter().for_each(|transform| drop(sender.send(transform)));
+    };
+    let far = &rig.sessions[1];
+    far.declare_subscriber(format!("{ROBOT}/tf")).callback(told).background().await.unwrap();
+    for moment in drive_in(Place::Corridor, 300).iter().skip(200) {
+        rig.robot.scan(moment).await;
+        rig.verdict().await;
+    }
+    let status = rig.daemon.status();
+    assert!(status.filter.weak_directions > 50, "{:?}", status.filter);
+    let weak = status.filter.weak_direction.unwrap();
+    assert!(weak.x.abs() > 0.9, "the corridor is along x: {weak:?}");
+    assert!(status.detail.contains("corridor"), "{}", status.detail);
+
+    let transform = tokio::time::timeout(PATIENCE, transforms.recv()).await.unwrap().unwrap();
+    let frames = (transform.header.frame_id.as_str(), transform.child_frame_id.as_str());
+    assert_eq!(frames, ("map", "base_link"));
     rig.end().await;
 }
 

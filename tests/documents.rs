@@ -8,7 +8,7 @@ use gmapd::config::RawConfig;
 use serde_json::Value;
 
 /// Documents whose file names must be there.
-const DOCUMENTS: [&str; 9] = [
+const DOCUMENTS: [&str; 10] = [
     "README.md",
     "CHANGELOG.md",
     "docs/architecture.md",
@@ -17,6 +17,7 @@ const DOCUMENTS: [&str; 9] = [
     "docs/parameters.md",
     "docs/ros2.md",
     "docs/security.md",
+    "docs/state.md",
     "bridge/README.md",
 ];
 

@@ -17,6 +17,7 @@ mod run;
 mod save;
 mod session;
 mod simulate;
+mod state;
 mod view;
 
 use clap::{Parser, Subcommand};
@@ -67,6 +68,8 @@ pub(crate) enum Command {
     Record(record::Arguments),
     /// Map a recorded run
     Replay(replay::Arguments),
+    /// Look into the state that a daemon keeps
+    State(state::Arguments),
     /// Drive a simulated robot and record what it sees
     Simulate(simulate::SimulateArgs),
     /// Compare a trajectory with known relations between its poses
@@ -86,6 +89,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<()> {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Record(arguments) => record::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
+        Command::State(arguments) => state::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
     }

@@ -83,6 +83,7 @@ pub(super) fn status(answer: &Answer) -> Option<String> {
     line("scans", scans(&status));
     line("speed", speed(&status));
     line("filter", filter(&status));
+    line("kept", state_on_disk(&status));
     line("memory", megabytes(&status["peak_memory_bytes"]));
     line("daemon", daemon(&status));
     for (name, input) in status["inputs"].as_object().into_iter().flatten() {
@@ -139,6 +140,21 @@ fn filter(status: &Value) -> Option<String> {
     Some(format!("{particles} particles{effective}, resampled {resamples} times"))
 }
 
+/// The last checkpoint, and why there is no newer one.
+fn state_on_disk(status: &Value) -> Option<String> {
+    let checkpoint = &status["checkpoint"];
+    let error = checkpoint["error"].as_str();
+    let last = &checkpoint["last"];
+    let written = last["file"].as_str().map(|file| {
+        let (scans, bytes) = (&last["scans"], last["bytes"].as_f64().unwrap_or(0.0));
+        format!("the state after {scans} scans in {file}, {:.1} MB", bytes / 1e6)
+    });
+    match (written, error) {
+        (Some(written), Some(error)) => Some(format!("{written}; {error}")),
+        (written, error) => written.or(error.map(str::to_owned)),
+    }
+}
+
 fn megabytes(bytes: &Value) -> Option<String> {
     bytes.as_f64().map(|bytes| format!("{:.1} MB at most", bytes / 1e6))
 }
@@ -179,7 +195,8 @@ mod tests {
             "detail":"no scan came","pose_in_map":{"x":1.0,"y":2.0,"theta":0.0},
             "scans":{"processed":5,"late":0,"not_moved_enough":2},
             "inputs":{"scan":{"key":"r/scan","received":7,"rejected":1,"last_rejection":"bad"}},
-            "milliseconds_per_scan":null,"map":null,"filter":{"particles":30,"resamples":0}}"#;
+            "milliseconds_per_scan":null,"map":null,"filter":{"particles":30,"resamples":0},
+            "checkpoint":{"error":"no room","last":{"file":"a.state","scans":7,"bytes":1234567}}}"#;
         let text = super::status(&answer(status)).unwrap();
         assert!(text.starts_with("state        waiting for scans\n             no scan came\n"));
         assert!(
@@ -188,6 +205,8 @@ mod tests {
             "{text}"
         );
         assert!(text.contains("scan         r/scan: 7 received, 1 rejected; bad\n"), "{text}");
+        let kept = "kept         the state after 7 scans in a.state, 1.2 MB; no room\n";
+        assert!(text.contains(kept), "{text}");
         assert!(!text.contains("map ") && !text.contains("speed"), "{text}");
         assert_eq!(super::status(&answer(b"{}")), None);
     }

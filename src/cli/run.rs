@@ -38,7 +38,9 @@ const LAST_BREATH: Duration = Duration::from_millis(100);
         gmapd run --prefix robot01                     on the local network\n  \
         gmapd run --prefix robot01 -e tcp/10.0.0.1:7447\n                                                 \
         through a router\n  \
-        gmapd run --config config/gmapd.yaml --set laser='{x: 0.2}' -l tcp/0.0.0.0:7447\n\n\
+        gmapd run --config config/gmapd.yaml --set laser='{x: 0.2}' -l tcp/0.0.0.0:7447\n  \
+        gmapd run --prefix robot01 --state /var/lib/gmapd\n                                                 \
+        goes on where it was, after a crash too\n\n\
     Then, from anywhere on the mesh:\n  \
         gmapd get robot01 status                       what it does, and why the map does not grow\n\n\
     Exit codes: 0 ended by a signal, 1 failed, 2 wrong usage, 130 ended by a second signal.")]
@@ -61,6 +63,9 @@ pub(crate) struct Arguments {
     /// Threads of the filter; one a processor without. The result is the same for any number
     #[arg(long, value_name = "N")]
     threads: Option<NonZeroUsize>,
+    /// Keep the state in DIR, and go on from there after a restart; the same as state_directory
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
     #[command(flatten)]
     mesh: SessionArguments,
 }
@@ -97,7 +102,11 @@ fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
     let mut overrides = arguments.set.clone();
     overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
-    let config = Config::load(arguments.config.as_deref(), &overrides)?;
+    let mut config = Config::load(arguments.config.as_deref(), &overrides)?;
+    if let Some(directory) = &arguments.state {
+        let text = directory.to_str().context("the path of --state is not UTF-8")?;
+        config.raw.state_directory = Some(text.to_owned());
+    }
     for warning in &config.warnings {
         tracing::warn!("{warning}");
     }

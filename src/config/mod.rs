@@ -7,14 +7,16 @@ mod check;
 mod raw;
 mod source;
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use serde_json::Value;
 use thiserror::Error;
 
 pub use raw::{
-    CommandName, EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher, OdometrySource, RawConfig,
-    RosDistro, Smoothing,
+    Checkpoint, CommandName, EngineKind, Interop, Jump, Keys, Laser, MapOf, Matcher,
+    OdometrySource, RawConfig, RosDistro, Smoothing,
 };
 pub use source::Origin;
 
@@ -164,6 +166,22 @@ impl Config {
             }
         }
         config
+    }
+
+    /// The keys that a state depends on, with their values: who goes on from it needs the same.
+    #[must_use]
+    pub fn settings_of_state(&self) -> BTreeMap<String, Value> {
+        let Ok(Value::Object(keys)) = serde_json::to_value(&self.raw) else {
+            return BTreeMap::new();
+        };
+        let without_effect = |key: &str| {
+            raw::WITHOUT_EFFECT_ON_STATE.contains(&key)
+                || raw::DEAD_KEYS.contains(&key)
+                || raw::EXTENT_KEYS.contains(&key)
+                || of_another_engine(key, self.raw.engine).is_some()
+                || raw::COMPAT_KEYS.contains(&key) && self.raw.matcher == Matcher::Field
+        };
+        keys.into_iter().filter(|(key, _)| !without_effect(key)).collect()
     }
 
     /// Whether given poses come as messages on `keys: pose`, in place of odometry's.

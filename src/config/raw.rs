@@ -64,6 +64,10 @@ pub struct RawConfig {
     pub max_reply_bytes: usize,
     /// File to which inputs and outputs are recorded, MCAP; left out, they are not.
     pub record: Option<String>,
+    /// Directory that the state is kept in, to go on from after a restart; left out, it is not kept.
+    pub state_directory: Option<String>,
+    /// How often the state is written there.
+    pub checkpoint: Checkpoint,
 
     /// Readings strictly above are discarded, m; left out, the sensor's own limit.
     #[serde(rename = "maxRange")]
@@ -252,6 +256,28 @@ pub(super) const GMAPPING_ONLY: [(&str, &str); 5] = [
 /// Keys that size the original's first map.
 pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
 
+/// Keys that the state does not depend on: how the mesh and files are met, and what is handed out.
+pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 18] = [
+    "map_update_interval",
+    "transform_publish_period",
+    "tf_delay",
+    "prefix",
+    "keys",
+    "interop",
+    "ros_domain_id",
+    "ros_distro",
+    "odometry_timeout_s",
+    "scan_queue",
+    "save_directory",
+    "save_on_exit",
+    "record",
+    "state_directory",
+    "checkpoint",
+    "engine",
+    "occ_thresh",
+    "occ_min_visits",
+];
+
 /// Keys that only the compat matcher looks at.
 pub(super) const COMPAT_KEYS: [&str; 4] = ["sigma", "kernelSize", "lsigma", "iterations"];
 
@@ -288,6 +314,8 @@ impl Default for RawConfig {
             max_message_bytes: 4 << 20,
             max_reply_bytes: 64 << 20,
             record: None,
+            state_directory: None,
+            checkpoint: Checkpoint::default(),
             max_range: core.max_range,
             max_usable_range: core.max_usable_range,
             beam_skip: core.matcher.beam_skip,
@@ -407,6 +435,8 @@ impl Default for Keys {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CommandName {
+    /// Write the state to the disk.
+    Checkpoint,
     /// Say where the robot is.
     InitialPose,
     /// Take no scans.
@@ -421,8 +451,26 @@ pub enum CommandName {
 
 impl CommandName {
     /// All of them.
-    pub const ALL: [Self; 5] =
-        [Self::InitialPose, Self::Pause, Self::Reset, Self::Resume, Self::Save];
+    pub const ALL: [Self; 6] =
+        [Self::Checkpoint, Self::InitialPose, Self::Pause, Self::Reset, Self::Resume, Self::Save];
+}
+
+/// How often the state is written, and how many of those writings are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Checkpoint {
+    /// Seconds after which scans that came since are written.
+    pub every_s: f64,
+    /// Scans after which they are, if that is sooner.
+    pub every_scans: u64,
+    /// Good checkpoints that are kept.
+    pub keep: usize,
+}
+
+impl Default for Checkpoint {
+    fn default() -> Self {
+        Self { every_s: 10.0, every_scans: 200, keep: 3 }
+    }
 }
 
 /// How ROS 2 nodes are met.

@@ -11,7 +11,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot, watch};
 use zenoh::bytes::Encoding;
 
-use super::command::{Command, Request};
+use super::command::{Command, Done, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
 use super::save::{SaveError, SaveName, Saver};
 use super::selector::{
@@ -59,6 +59,8 @@ pub(super) enum Refusal {
     NoEntropy,
     #[error(transparent)]
     Save(#[from] SaveError),
+    #[error("{0}")]
+    NotDone(String),
     #[error("a command is not done by a wildcard; ask {0} itself")]
     Wildcard(&'static str),
     #[error("{0} is switched off on this robot: `commands` in its configuration does not have it")]
@@ -170,6 +172,7 @@ impl Responder {
             Question::Pause => self.command(Command::Pause),
             Question::Resume => self.command(Command::Resume),
             Question::InitialPose(pose) => self.command(Command::InitialPose(*pose)),
+            Question::Checkpoint => self.checkpoint(),
             Question::Save(name) => self.save(&snapshot, name),
         }
     }
@@ -219,7 +222,18 @@ impl Responder {
         Ok(ros::PoseWithCovarianceStamped { header: convert::header(at, &self.map_frame), pose })
     }
 
+    fn checkpoint(&self) -> Result<Answer, Refusal> {
+        match self.done(Command::Checkpoint)? {
+            done if done.changed => Ok(json(&done)),
+            done => Err(Refusal::NotDone(done.done)),
+        }
+    }
+
     fn command(&self, command: Command) -> Result<Answer, Refusal> {
+        Ok(json(&self.done(command)?))
+    }
+
+    fn done(&self, command: Command) -> Result<Done, Refusal> {
         let (reply, answer) = oneshot::channel();
         self.commands.try_send(Request { command, reply }).map_err(|error| match error {
             mpsc::error::TrySendError::Full(_) => Refusal::CommandsWaiting,
@@ -228,7 +242,7 @@ impl Responder {
         let answer = Handle::current()
             .block_on(async { tokio::time::timeout(LONGEST_COMMAND, answer).await });
         match answer {
-            Ok(Ok(done)) => Ok(json(&done)),
+            Ok(Ok(done)) => Ok(done),
             Ok(Err(_)) => Err(Refusal::Stopping),
             Err(_) => Err(Refusal::NoReply(LONGEST_COMMAND)),
         }

@@ -15,6 +15,8 @@ pub enum Command {
     Pause,
     /// Take scans again.
     Resume,
+    /// Write the state to the disk, to go on from after a restart.
+    Checkpoint,
     /// The robot is here: before the first scan, where the map begins; later, all particles move.
     InitialPose(Pose2),
 }

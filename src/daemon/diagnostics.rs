@@ -79,6 +79,7 @@ mod tests {
             scans_waiting: 0,
             filter: FilterStatus { particles: 30, ..FilterStatus::default() },
             map: None,
+            checkpoint: None,
             peak_memory_bytes: None,
             seed: 1,
         }

@@ -3,11 +3,13 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::convert::{self, ConvertError};
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::LaserMount;
+use crate::slam::state::{StateError, ensure};
 use crate::tf::{Kind, RefusedTransform, TfBuffer, TfCounts, TfError, Transform};
 use crate::timeline::Missing;
 
@@ -77,7 +79,36 @@ pub struct Frames {
     unresolved: VecDeque<Stamp>,
 }
 
+/// The transforms as plain data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FramesState {
+    buffer: TfBuffer,
+    unresolved: VecDeque<Stamp>,
+}
+
+impl FramesState {
+    /// Looks whether all parts fit together.
+    ///
+    /// # Errors
+    /// When frames hang in a ring, or there are more than are kept.
+    pub fn check(&self) -> Result<(), StateError> {
+        let few = self.unresolved.len() <= MOST_UNRESOLVED;
+        ensure(few && self.buffer.is_sound(), "transforms")
+    }
+}
+
 impl Frames {
+    /// The transforms as plain data.
+    #[must_use]
+    pub fn state(&self) -> FramesState {
+        FramesState { buffer: self.buffer.clone(), unresolved: self.unresolved.clone() }
+    }
+
+    /// Goes on from a state.
+    pub fn resume(&mut self, FramesState { buffer, unresolved }: FramesState) {
+        (self.buffer, self.unresolved) = (buffer, unresolved);
+    }
+
     /// No transform yet; `configured` overrides what transforms will say of the laser.
     #[must_use]
     pub const fn new(names: FrameNames, configured: Option<LaserMount>, tf_static: String) -> Self {

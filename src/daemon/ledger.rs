@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::slam::pose::Stamp;
 use crate::slam::update::SkipReason;
 
 /// What became of a scan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
     /// It is in the map.
@@ -74,7 +74,7 @@ impl From<SkipReason> for Verdict {
 }
 
 /// A scan's verdict with what there is to say about it: one sample on `slam/verdict`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Entry {
     /// How many scans have had their verdict, this one included.
     pub number: u64,
@@ -87,11 +87,33 @@ pub struct Entry {
 }
 
 /// The verdicts so far; cheap to copy, for every snapshot has one.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(from = "Counted", into = "Counted")]
 pub struct Ledger {
     counts: Arc<BTreeMap<Verdict, u64>>,
     total: u64,
     last: Arc<BTreeMap<Verdict, Entry>>,
+}
+
+/// A ledger as plain data.
+#[derive(Serialize, Deserialize)]
+struct Counted {
+    counts: BTreeMap<Verdict, u64>,
+    total: u64,
+    last: BTreeMap<Verdict, Entry>,
+}
+
+impl From<Ledger> for Counted {
+    fn from(ledger: Ledger) -> Self {
+        let Ledger { counts, total, last } = ledger;
+        Self { counts: Arc::unwrap_or_clone(counts), total, last: Arc::unwrap_or_clone(last) }
+    }
+}
+
+impl From<Counted> for Ledger {
+    fn from(Counted { counts, total, last }: Counted) -> Self {
+        Self { counts: Arc::new(counts), total, last: Arc::new(last) }
+    }
 }
 
 impl Ledger {

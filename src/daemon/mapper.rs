@@ -1,11 +1,15 @@
 //! The filter's thread: takes what comes, and leaves snapshots and verdicts.
 
+pub mod state;
+
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use tokio::sync::{broadcast, watch};
+use serde::{Deserialize, Serialize};
+use tokio::sync::{broadcast, oneshot, watch};
 
+use super::checkpointing::Keeper;
 use super::command::{Command, Done, Request};
 use super::frames::{FrameNames, Frames};
 use super::input::{Inbox, Input, input_of};
@@ -51,21 +55,26 @@ pub struct Connections {
 }
 
 /// How it goes: what the status tells beside the snapshot.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Gauges {
     /// Scans that wait for odometry.
+    #[serde(skip)]
     pub scans_waiting: usize,
     /// How the laser of the last scan sits.
     pub laser: Option<LaserMount>,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
     /// Where odometry comes from.
+    #[serde(skip)]
     pub channel: Option<Channel>,
     /// Of the odometry.
+    #[serde(skip)]
     pub odometry: TimelineCounts,
     /// Of the transforms.
+    #[serde(skip)]
     pub transforms: TfCounts,
     /// Of the scans.
+    #[serde(skip)]
     pub scans: ScanCounts,
     /// Verdicts of the last scans, oldest first.
     pub recent: VecDeque<Verdict>,
@@ -101,6 +110,8 @@ pub struct Mapper {
     gauges: Gauges,
     /// Verdicts since the last snapshot.
     untold: Vec<Entry>,
+    /// Writes the state to the disk, where that is configured.
+    keeper: Option<Keeper>,
 }
 
 /// What goes into the next snapshot.
@@ -199,6 +210,7 @@ impl Mapper {
             view: View::new(),
             gauges: Gauges::default(),
             untold: Vec::new(),
+            keeper: None,
         };
         mapper.renew_estimate(None);
         mapper.publish();
@@ -209,6 +221,7 @@ impl Mapper {
     pub fn run(mut self) {
         while self.step() == Flow::GoOn {
             self.publish();
+            self.checkpoint_if_due();
         }
         self.finish();
     }
@@ -228,7 +241,39 @@ impl Mapper {
     fn next_event(&self) -> Event {
         let mailbox = &self.connections.mailbox;
         let event = mailbox.take(clock::now());
-        event.unwrap_or_else(|| mailbox.wait(self.synchronizer.deadline(), clock::now))
+        event.unwrap_or_else(|| mailbox.wait(self.deadline(), clock::now))
+    }
+
+    /// When there is something to do though nothing comes.
+    fn deadline(&self) -> Option<Instant> {
+        let keeper = self.keeper.as_ref();
+        let checkpoint = keeper.and_then(|keeper| keeper.deadline(clock::now(), self.scans()));
+        self.synchronizer.deadline().into_iter().chain(checkpoint).min()
+    }
+
+    /// Has the state written from now on.
+    pub(super) fn keep_state(&mut self, keeper: Keeper) {
+        self.keeper = Some(keeper);
+    }
+
+    /// Scans that had their verdict.
+    pub(super) fn scans(&self) -> u64 {
+        self.view.ledger.total()
+    }
+
+    fn checkpoint_if_due(&mut self) {
+        let scans = self.scans();
+        if self.keeper.as_ref().is_some_and(|keeper| keeper.is_due(clock::now(), scans)) {
+            self.checkpoint(None);
+        }
+    }
+
+    /// Has the state written; without a keeper, whoever waits for it hears nothing.
+    fn checkpoint(&mut self, done: Option<oneshot::Sender<Done>>) {
+        let (engine, state) = (self.engine.clone(), self.state());
+        if let Some(keeper) = &mut self.keeper {
+            keeper.write(engine, state, done);
+        }
     }
 
     fn handle(&mut self, event: Event) -> Flow {
@@ -418,6 +463,12 @@ impl Mapper {
     /// Whoever gets the answer finds it in the snapshot, too.
     fn obey(&mut self, request: Request) {
         let (done, changed) = match request.command {
+            Command::Checkpoint if self.keeper.is_some() => {
+                return self.checkpoint(Some(request.reply));
+            }
+            Command::Checkpoint => {
+                ("the state is not kept: neither --state nor state_directory is set".into(), false)
+            }
             Command::Pause => self.pause(),
             Command::Resume => self.resume(),
             Command::Reset(pose_in_map) => self.reset(pose_in_map),
@@ -426,6 +477,9 @@ impl Mapper {
         tracing::info!(command = ?request.command, done, "command");
         self.view.changed = true;
         self.publish();
+        if let Some(keeper) = &mut self.keeper {
+            keeper.note_command();
+        }
         // Whoever asked may be gone.
         request.reply.send(Done { done, changed }).ok();
     }
@@ -480,7 +534,9 @@ impl Mapper {
     }
 
     fn finish(mut self) {
-        self.synchronizer.finish(&self.frames);
+        if self.keeper.is_none() {
+            self.synchronizer.finish(&self.frames);
+        }
         while let Some(call) = self.synchronizer.next_call() {
             if self.connections.mailbox.is_over(clock::now()) {
                 break;
@@ -489,6 +545,17 @@ impl Mapper {
         }
         self.renew_map();
         self.publish();
+        self.checkpoint_last();
+    }
+
+    /// Scans that wait for their odometry are in the state, and wait on after the restart.
+    fn checkpoint_last(&mut self) {
+        if self.keeper.is_some() {
+            let (done, written) = oneshot::channel();
+            self.checkpoint(Some(done));
+            // The thread tells of what goes wrong.
+            written.blocking_recv().ok();
+        }
     }
 
     /// Whoever hears of a verdict finds it in the snapshot.

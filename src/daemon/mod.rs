@@ -6,6 +6,7 @@
 //! From these [`serving`] publishes and answers.
 
 mod answers;
+pub mod checkpointing;
 pub mod command;
 mod diagnostics;
 pub mod formats;
@@ -45,6 +46,7 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt as _, HistoryConfig};
 
+use self::checkpointing::CheckpointsError;
 use self::command::Request;
 use self::formats::{EmptyMap, MapProducts};
 use self::input::{Inbox, Input};
@@ -110,6 +112,9 @@ pub enum DaemonError {
     /// The filter's threads do not start.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
+    /// The state cannot be kept.
+    #[error("state: {0}")]
+    Checkpoints(#[from] CheckpointsError),
     /// The thread `mapper` does not start.
     #[error("cannot start the thread that maps")]
     Mapper(#[source] std::io::Error),
@@ -227,9 +232,9 @@ impl Daemon {
     pub async fn start(session: &zenoh::Session, settings: Settings) -> Result<Self, DaemonError> {
         let Settings { config, prefix, threads } = settings;
         let convention = Convention::new(&config.raw);
-        let mut node = RosNode::new(session.zid().to_string(), prefix, convention);
+        let mut node = RosNode::new(session.zid().to_string(), prefix.clone(), convention);
         let keys = node.inputs(&config.raw.keys, Input::of_motion(&config))?;
-        let mut daemon = Self::deaf(&config, &keys, threads)?;
+        let mut daemon = Self::deaf(&config, &prefix, &keys, threads)?;
         daemon
             .links
             .watch(session)
@@ -249,7 +254,12 @@ impl Daemon {
     }
 
     /// All threads and tasks of a daemon that hears and tells nothing yet.
-    fn deaf(config: &Config, keys: &InputKeys, threads: usize) -> Result<Self, DaemonError> {
+    fn deaf(
+        config: &Config,
+        prefix: &Prefix,
+        keys: &InputKeys,
+        threads: usize,
+    ) -> Result<Self, DaemonError> {
         let saving = Saving::new(config)?;
         let inbox = Arc::new(Inbox::new(config.raw.max_message_bytes));
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
@@ -264,7 +274,9 @@ impl Daemon {
             verdicts: verdicts.clone(),
             gauges: Arc::clone(&gauges),
         };
-        let mapper = spawn(Mapper::new(connections, config, keys, threads)?)?;
+        let mut mapper = Mapper::new(connections, config, keys, threads)?;
+        let checkpoints = checkpointing::attach(&mut mapper, config, prefix)?;
+        let mapper = spawn(mapper)?;
         let decoder = tokio::spawn(input::decode(Arc::clone(&inbox), Arc::clone(&mailbox)));
         let shared = Shared {
             inbox: Arc::clone(&inbox),
@@ -272,6 +284,7 @@ impl Daemon {
             gauges,
             snapshots: snapshots.clone(),
             links: Arc::clone(&links),
+            checkpoints,
         };
         let status = Arc::new(StatusSource::new(keys.clone(), &config.raw, shared));
         let (commands, requests) = mpsc::channel(COMMANDS);

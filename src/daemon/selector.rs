@@ -66,11 +66,13 @@ pub enum Topic {
     InitialPose,
     /// Write the map to files.
     Save,
+    /// Write the state, to go on from.
+    Checkpoint,
 }
 
 impl Topic {
     /// All that can be asked.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Map,
         Self::DynamicMap,
         Self::MapMetadata,
@@ -85,6 +87,7 @@ impl Topic {
         Self::Resume,
         Self::InitialPose,
         Self::Save,
+        Self::Checkpoint,
     ];
 
     /// The key under the robot's prefix.
@@ -105,6 +108,7 @@ impl Topic {
             Self::Resume => "slam/cmd/resume",
             Self::InitialPose => "slam/cmd/initial_pose",
             Self::Save => "slam/cmd/save",
+            Self::Checkpoint => "slam/cmd/checkpoint",
         }
     }
 
@@ -117,6 +121,7 @@ impl Topic {
             Self::Resume => Some(CommandName::Resume),
             Self::InitialPose => Some(CommandName::InitialPose),
             Self::Save => Some(CommandName::Save),
+            Self::Checkpoint => Some(CommandName::Checkpoint),
             Self::Map
             | Self::DynamicMap
             | Self::MapMetadata
@@ -171,6 +176,7 @@ impl Topic {
                 let name = parameters.get("name").map(SaveName::parse).transpose()?;
                 Question::Save(name.unwrap_or_default())
             }
+            Self::Checkpoint => of(&[]).map(|_| Question::Checkpoint)?,
         })
     }
 }
@@ -213,6 +219,8 @@ pub enum Question {
     InitialPose(Pose2),
     /// Write the map to files of this name.
     Save(SaveName),
+    /// Write the state, to go on from.
+    Checkpoint,
 }
 
 /// Which part of the map is asked for, and what of it.
@@ -602,6 +610,7 @@ mod tests {
         assert_eq!(asked(Topic::Status), Ok(Question::Status));
         assert_eq!(asked(Topic::Reset), Ok(Question::Reset(None)));
         assert_eq!(asked(Topic::Pause), Ok(Question::Pause));
+        assert_eq!(asked(Topic::Checkpoint), Ok(Question::Checkpoint));
         assert_eq!(asked(Topic::Resume), Ok(Question::Resume));
         assert_eq!(asked(Topic::InitialPose), Err(SelectorError::NoPose));
         assert_eq!(asked(Topic::Save), Ok(Question::Save(SaveName::default())));

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::Matrix3;
-use serde::Serialize;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::ledger::Ledger;
 use crate::slam::grid::occupancy::{OccupancyMap, OccupiedThreshold};
@@ -30,7 +30,7 @@ pub struct Snapshot {
 }
 
 /// Where the robot is, and how sure that is.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// Of the last scan or odometry that moved the pose; `None` before the first.
     pub stamp: Option<Stamp>,
@@ -43,9 +43,18 @@ pub struct Estimate {
     /// Whether the last scan came with odometry; without, `map` to the base is told.
     pub has_odometry: bool,
     /// The base in `map`, one pose a particle, at the last processed scan.
+    #[serde(serialize_with = "write_poses", deserialize_with = "read_poses")]
     pub particles: Arc<[Pose2]>,
     /// About the last processed scan; `None` before the first.
     pub report: Option<ScanReport>,
+}
+
+fn write_poses<S: Serializer>(poses: &Arc<[Pose2]>, to: S) -> Result<S::Ok, S::Error> {
+    poses[..].serialize(to)
+}
+
+fn read_poses<'de, D: Deserializer<'de>>(from: D) -> Result<Arc<[Pose2]>, D::Error> {
+    Vec::deserialize(from).map(Arc::from)
 }
 
 /// One version of the map. A copy costs little: tiles and poses are shared.

@@ -7,6 +7,7 @@ use std::time::Instant;
 use serde::Serialize;
 use tokio::sync::watch;
 
+use super::checkpointing::{CheckpointStatus, SharedStatus};
 use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
 use super::keys::InputKeys;
@@ -59,6 +60,8 @@ pub struct Status {
     pub filter: FilterStatus,
     /// The map that is handed out; `null` before the first.
     pub map: Option<MapStatus>,
+    /// The state on disk; `null` if it is not kept.
+    pub checkpoint: Option<CheckpointStatus>,
     /// The most memory the process has had resident, bytes.
     pub peak_memory_bytes: Option<u64>,
     /// Seed of the random numbers.
@@ -136,6 +139,7 @@ pub struct StatusSource {
     gauges: Arc<Mutex<Gauges>>,
     snapshots: watch::Receiver<Arc<Snapshot>>,
     links: Arc<Links>,
+    checkpoints: Option<SharedStatus>,
     /// Of the version of the map that was asked for last.
     map: Mutex<Option<MapStatus>>,
 }
@@ -148,14 +152,27 @@ pub(super) struct Shared {
     pub(super) gauges: Arc<Mutex<Gauges>>,
     pub(super) snapshots: watch::Receiver<Arc<Snapshot>>,
     pub(super) links: Arc<Links>,
+    pub(super) checkpoints: Option<SharedStatus>,
 }
 
 impl StatusSource {
     pub(super) fn new(keys: InputKeys, config: &RawConfig, shared: Shared) -> Self {
-        let Shared { inbox, mailbox, gauges, snapshots, links } = shared;
+        let Shared { inbox, mailbox, gauges, snapshots, links, checkpoints } = shared;
         let &RawConfig { engine, seed, .. } = config;
         let (started, map) = (clock::now(), Mutex::default());
-        Self { started, keys, engine, seed, inbox, mailbox, gauges, snapshots, links, map }
+        Self {
+            started,
+            keys,
+            engine,
+            seed,
+            inbox,
+            mailbox,
+            gauges,
+            snapshots,
+            links,
+            checkpoints,
+            map,
+        }
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -207,6 +224,7 @@ impl StatusSource {
             scans_waiting: self.mailbox.scans() + gauges.scans_waiting,
             filter: filter_status(&snapshot, &gauges),
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
+            checkpoint: self.checkpoints.as_ref().map(told),
             peak_memory_bytes: clock::peak_resident_memory(),
             engine: self.engine,
             links: self.links.status(),
@@ -273,6 +291,10 @@ impl MapStatus {
             scans,
         }
     }
+}
+
+fn told(checkpoints: &SharedStatus) -> CheckpointStatus {
+    checkpoints.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
 fn with_counts(status: InputStatus, counts: TimelineCounts) -> InputStatus {

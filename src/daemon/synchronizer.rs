@@ -4,9 +4,14 @@
 //! to the scan, and the scan with odometry's pose at its stamp: what it gets does not depend on
 //! what came first, as long as nothing is late. No clock is read here.
 
+pub mod state;
+
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use serde::{Deserialize, Serialize};
+
+use self::state::{Again, KNOWN_AGAIN};
 use super::frames::{Frames, MountError};
 use super::ledger::Verdict;
 use crate::config::OdometrySource;
@@ -93,7 +98,7 @@ pub enum Need {
 }
 
 /// Odometry's messages or its transforms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Channel {
     /// `nav_msgs/Odometry`.
     Messages,
@@ -102,7 +107,7 @@ pub enum Channel {
 }
 
 /// A scan and the frame of its laser.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FramedScan {
     /// The sweep.
     pub scan: Scan,
@@ -111,7 +116,7 @@ pub struct FramedScan {
 }
 
 /// What is to be done next.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Call {
     /// The filter takes odometry of a stamp.
     Odometry(Stamp, Pose2),
@@ -122,7 +127,7 @@ pub enum Call {
 }
 
 /// A scan with all that is needed to use it.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReadyScan {
     /// The sweep.
     pub scan: Scan,
@@ -133,7 +138,7 @@ pub struct ReadyScan {
 }
 
 /// A scan that does not reach the filter.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refusal {
     /// The scan's; `None` if its bytes could not be read.
     pub stamp: Option<Stamp>,
@@ -144,7 +149,7 @@ pub struct Refusal {
 }
 
 /// What became of scans that were not simply the newest.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ScanCounts {
     /// With the stamp of an earlier one.
     pub duplicates: u64,
@@ -218,6 +223,10 @@ pub struct Synchronizer {
     counts: ScanCounts,
     /// Whether a scan has waited for the first odometry in vain.
     waited_in_vain: bool,
+    /// The last scans, whatever became of them.
+    seen: VecDeque<Stamp>,
+    /// What is fed again after a restart.
+    again: Again,
 }
 
 impl Synchronizer {
@@ -235,6 +244,8 @@ impl Synchronizer {
             calls: VecDeque::new(),
             counts: ScanCounts::default(),
             waited_in_vain: false,
+            seen: VecDeque::new(),
+            again: Again::default(),
         }
     }
 
@@ -247,6 +258,10 @@ impl Synchronizer {
     ) -> bool {
         if !self.listens_to(channel) {
             return false;
+        }
+        if self.again.knows_odometry(stamp) && self.odometry.is_too_late(stamp) {
+            self.odometry.count_duplicate();
+            return true;
         }
         // What is about to be forgotten, for this sample comes long after it.
         self.feed(Stamp(stamp.0.saturating_sub(HORIZON)));
@@ -287,6 +302,13 @@ impl Synchronizer {
     /// Takes a scan at the time `now`.
     pub fn scan(&mut self, framed: FramedScan, now: Instant, frames: &Frames) {
         let stamp = framed.scan.stamp;
+        if self.again.knows_scan(stamp, &self.seen) {
+            self.counts.duplicates += 1;
+            let detail = "it had its verdict before the restart".to_owned();
+            self.refuse(stamp, Verdict::Duplicate, detail);
+            return;
+        }
+        self.remember(stamp);
         if let Some((verdict, detail)) = self.out_of_order(stamp) {
             self.refuse(stamp, verdict, detail);
             return;
@@ -301,6 +323,13 @@ impl Synchronizer {
         self.waiting.insert(position, Waiting { framed, since: now, goes_without: false });
         self.release(frames);
         self.make_room();
+    }
+
+    fn remember(&mut self, stamp: Stamp) {
+        if self.seen.len() >= KNOWN_AGAIN {
+            self.seen.pop_front();
+        }
+        self.seen.push_back(stamp);
     }
 
     /// What a scan is that does not come after the last that was taken.
@@ -318,6 +347,7 @@ impl Synchronizer {
             if suspect.is_some_and(follows) {
                 self.counts.clock_restarts += 1;
                 self.taken = None;
+                self.again = Again::default();
                 return None;
             }
             self.suspect = Some(stamp);

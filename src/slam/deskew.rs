@@ -3,13 +3,15 @@
 //! A laser that turns once in a tenth of a second sees its last beam from elsewhere than its
 //! first. The base is taken to move evenly meanwhile.
 
+use serde::{Deserialize, Serialize};
+
 use super::pose::Pose2;
 
 /// Turns slower than this, rad, are straight: the difference is below a nanometre a metre.
 const STRAIGHT: f64 = 1e-9;
 
 /// How the base moves, in its own frame.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Velocity {
     /// Ahead, m/s.
     pub x: f64,

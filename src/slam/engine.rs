@@ -10,6 +10,7 @@ use super::known_poses::{self, KnownPoses};
 use super::path::Path;
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
+use super::state::{EngineState, StateError};
 use super::update::{OdometryUpdate, OnPhase, ScanReading, ScanUpdate, SkipReason};
 
 /// Which system maps, with its parameters.
@@ -24,7 +25,7 @@ pub enum EngineParameters {
 }
 
 /// A system that makes a map and a path of scans and odometry.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub enum Engine {
     /// A particle filter.
     GMapping(Box<GMapping>),
@@ -60,6 +61,32 @@ impl Engine {
             }
             EngineParameters::KnownPoses(parameters) => {
                 Ok(Self::KnownPoses(Box::new(KnownPoses::new(parameters))))
+            }
+        }
+    }
+
+    /// All that it knows, to go on from later. A clone of the engine costs little; this does not.
+    #[must_use]
+    pub fn state(&self) -> EngineState {
+        match self {
+            Self::GMapping(filter) => EngineState::GMapping(Box::new(filter.state())),
+            Self::Hector(hector) => EngineState::Hector(Box::new(hector.state())),
+            Self::KnownPoses(mapping) => EngineState::KnownPoses(Box::new(mapping.state())),
+        }
+    }
+
+    /// Goes on from a state: what comes next gives the same bytes as where the state is from.
+    ///
+    /// # Errors
+    /// When the state is of another engine, or is not one that an engine with these parameters can
+    /// have; nothing is changed.
+    pub fn resume(&mut self, state: EngineState) -> Result<(), StateError> {
+        match (self, state) {
+            (Self::GMapping(filter), EngineState::GMapping(state)) => filter.resume(*state),
+            (Self::Hector(hector), EngineState::Hector(state)) => hector.resume(*state),
+            (Self::KnownPoses(mapping), EngineState::KnownPoses(state)) => mapping.resume(*state),
+            (Self::GMapping(_) | Self::Hector(_) | Self::KnownPoses(_), _) => {
+                Err(StateError::OtherEngine)
             }
         }
     }

@@ -6,11 +6,15 @@
 //! coarse grids empty, and takes nothing of a beam that ends outside of the map; here the grid
 //! grows, and beams are as long as they are.
 
-use super::grid::occupancy::{BeamEndKind, OccupancyMap, OccupiedThreshold};
+use serde::{Deserialize, Serialize};
+
+use super::grid::occupancy::{BeamEndKind, Count, OccupancyMap, OccupiedThreshold};
+use super::grid::tile_map::saved::SavedMaps;
 use super::odometry::{JumpGuard, JumpPolicy};
 use super::outline::{BeamLimits, outline};
 use super::path::Path;
 use super::pose::Pose2;
+use super::state::{StateError, ensure_poses};
 use super::update::{
     OdometryUpdate, OnPhase, Phase, ScanReading, ScanReport, ScanUpdate, SkipReason,
 };
@@ -44,12 +48,20 @@ pub enum MapExtent {
 }
 
 /// A map along given poses.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct KnownPoses {
     parameters: Parameters,
     map: OccupancyMap,
     path: Path,
     /// The last that was given.
+    pose_in_map: Pose2,
+}
+
+/// All that mapping along given poses knows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct KnownPosesState {
+    counts: SavedMaps<Count>,
+    path: Path,
     pose_in_map: Pose2,
 }
 
@@ -64,6 +76,26 @@ impl KnownPoses {
     /// Forgets map and path; where the base is, the next pose says.
     pub fn reset(&mut self) {
         *self = Self::new(self.parameters);
+    }
+
+    /// All that it knows now.
+    #[must_use]
+    pub fn state(&self) -> KnownPosesState {
+        let Self { map, path, pose_in_map, .. } = self;
+        let counts = SavedMaps::of([map.counts()]);
+        KnownPosesState { counts, path: path.clone(), pose_in_map: *pose_in_map }
+    }
+
+    /// Goes on from a state of mapping with the same parameters.
+    ///
+    /// # Errors
+    /// When the state is not one that there can be; nothing is changed.
+    pub fn resume(&mut self, state: KnownPosesState) -> Result<(), StateError> {
+        let KnownPosesState { counts, path, pose_in_map } = state;
+        ensure_poses([pose_in_map].into_iter(), "the pose")?;
+        let map = OccupancyMap::of_counts(self.parameters.resolution, counts.restore_one()?);
+        *self = Self { parameters: self.parameters, map, path, pose_in_map };
+        Ok(())
     }
 
     /// Takes a pose: the base in `map`.

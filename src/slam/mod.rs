@@ -15,4 +15,5 @@ pub mod outline;
 pub mod path;
 pub mod pose;
 pub mod scan;
+pub mod state;
 pub mod update;

@@ -105,7 +105,7 @@ pub enum JumpPolicy {
 }
 
 /// The motion of the base between two moments, as odometry tells it.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Motion {
     /// The later base seen from the earlier one.
     pub increment: Pose2,
@@ -120,6 +120,12 @@ pub struct Motion {
 }
 
 impl Motion {
+    /// All its figures as poses, to look whether they are numbers.
+    pub(super) fn poses(&self) -> [Pose2; 2] {
+        let [along, across] = [self.forward, self.sideways];
+        [self.increment, Pose2::new(self.path_length + self.turned, along, across)]
+    }
+
     /// Goes on by `step`, the base after it seen from the base before it.
     pub fn extend(&mut self, step: Pose2) {
         self.increment = self.increment * step;

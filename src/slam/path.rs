@@ -2,7 +2,10 @@
 
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use super::pose::{Pose2, Stamp};
+use super::state::{StateError, ensure_poses};
 
 /// Poses that copies of a path share as one.
 const CHUNK: usize = 256;
@@ -11,7 +14,8 @@ const CHUNK: usize = 256;
 ///
 /// A copy shares all but the last poses with its original, so that it costs little however long
 /// the way is.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<(Stamp, Pose2)>", into = "Vec<(Stamp, Pose2)>")]
 pub struct Path {
     chunks: Vec<Arc<[(Stamp, Pose2)]>>,
     /// Fewer than a chunk.
@@ -42,6 +46,21 @@ impl Path {
         if self.last.len() == CHUNK {
             self.chunks.push(self.last.drain(..).collect());
         }
+    }
+}
+
+impl From<Path> for Vec<(Stamp, Pose2)> {
+    fn from(path: Path) -> Self {
+        path.iter().collect()
+    }
+}
+
+impl TryFrom<Vec<(Stamp, Pose2)>> for Path {
+    type Error = StateError;
+
+    fn try_from(poses: Vec<(Stamp, Pose2)>) -> Result<Self, StateError> {
+        ensure_poses(poses.iter().map(|(_, pose)| *pose), "a pose of the path")?;
+        Ok(poses.into_iter().collect())
     }
 }
 

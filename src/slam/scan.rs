@@ -11,7 +11,7 @@ use super::pose::{Point2, Pose2, Stamp};
 /// Beam `i` points at `angle_min + i * angle_increment`: this one table serves matching and
 /// mapping alike (the original used two that differ by half an increment).
 /// A clockwise laser has a negative increment.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ScanGeometry {
     angle_min: f64,
     angle_increment: f64,
@@ -87,6 +87,13 @@ impl ScanGeometry {
             time_increment: 0.0,
             velocity: Velocity::default(),
         })
+    }
+
+    /// Whether it is such as [`Self::new`] makes; of one that was read, nobody knows.
+    #[must_use]
+    pub fn is_usable(&self) -> bool {
+        let Self { angle_min, angle_increment, range_min, range_max, .. } = *self;
+        Self::new([angle_min, angle_min], angle_increment, [range_min, range_max]).is_ok()
     }
 
     /// The same with `seconds` from beam to beam; 0 takes all at once.
@@ -168,7 +175,7 @@ pub enum Beam {
 }
 
 /// One sweep: readings in metres, in the order the sensor took them.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Scan {
     /// When the first beam was taken.
     pub stamp: Stamp,

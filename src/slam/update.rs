@@ -1,6 +1,6 @@
 //! What every engine takes, and what it says became of it.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::pose::Pose2;
 use super::scan::{LaserMount, Scan};
@@ -37,7 +37,7 @@ pub enum ScanUpdate {
 }
 
 /// Figures about a processed scan.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ScanReport {
     /// Hits that were matched.
     pub hits: usize,
@@ -60,7 +60,7 @@ pub struct ScanReport {
 /// A motion of the base that changes nothing of what its laser sees, as along a corridor.
 ///
 /// A unit vector: x² + y² + turn² = 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct WeakDirection {
     /// Its part along the x axis of `map`.
     pub x: f64,

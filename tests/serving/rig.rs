@@ -124,6 +124,7 @@ fn status() -> Status {
         scans_waiting: 0,
         filter: FilterStatus::default(),
         map: None,
+        checkpoint: None,
         peak_memory_bytes: None,
         seed: 1,
     }

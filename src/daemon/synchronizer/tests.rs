@@ -479,3 +479,76 @@ fn what_no_laser_takes_for_a_sweep_is_told() {
         "{details:?}"
     );
 }
+
+/// Another synchronizer that goes on from what this one leaves, as after a restart.
+fn restarted(rig: &Rig) -> Rig {
+    let bytes = postcard::to_stdvec(&rig.synchronizer.state()).unwrap();
+    let state: state::SynchronizerState = postcard::from_bytes(&bytes).unwrap();
+    assert_eq!(state, rig.synchronizer.state());
+    state.check().unwrap();
+    let mut next = Rig::new(settings());
+    next.synchronizer.resume(state, next.start);
+    next
+}
+
+/// A message of odometry, or a scan, and its stamp in milliseconds.
+fn message(index: i64) -> (bool, i64) {
+    (index % 4 == 3, index * 40)
+}
+
+fn give(rig: &mut Rig, (is_scan, milliseconds): (bool, i64)) {
+    if is_scan {
+        rig.scan(milliseconds - 10);
+    } else {
+        rig.odometry(milliseconds);
+    }
+}
+
+proptest! {
+    /// Wherever it was killed, and from wherever on it is fed again.
+    #[test]
+    fn what_is_fed_again_after_a_restart_changes_nothing(killed in 1..700_i64, again in 0.0..1.0) {
+        let mut whole = Rig::new(settings());
+        let mut rig = Rig::new(settings());
+        let mut told = Vec::new();
+        for index in 0..killed {
+            give(&mut whole, message(index));
+            give(&mut rig, message(index));
+            // What was ready and not called yet is in the state.
+            if index % 7 == 0 {
+                told.extend(rig.told());
+            }
+        }
+        let mut rig = restarted(&rig);
+        for index in (killed as f64 * again) as i64..killed {
+            give(&mut rig, message(index));
+        }
+        for index in killed..killed + 40 {
+            give(&mut whole, message(index));
+            give(&mut rig, message(index));
+        }
+        told.extend(rig.told().into_iter().filter(|told| !told.starts_with("Duplicate")));
+        prop_assert_eq!(told, whole.told());
+        prop_assert_eq!(rig.synchronizer.scan_counts().clock_restarts, 0);
+        prop_assert_eq!(rig.synchronizer.odometry_counts().restarts, 0);
+    }
+}
+
+#[test]
+fn a_clock_that_was_set_back_at_the_restart_is_none_that_feeds_again() {
+    let mut rig = Rig::new(settings());
+    (0..400).for_each(|index| give(&mut rig, message(index)));
+    rig.told();
+    let mut rig = restarted(&rig);
+    // Like the old stamps, but none of them is the same.
+    for milliseconds in (3003..5000).step_by(40) {
+        rig.odometry(milliseconds);
+        if milliseconds % 80 == 3 {
+            rig.scan(milliseconds - 11);
+        }
+    }
+    assert_eq!(rig.synchronizer.scan_counts().clock_restarts, 1);
+    assert_eq!(rig.synchronizer.odometry_counts().restarts, 1);
+    let told = rig.told();
+    assert!(told.iter().filter(|told| told.starts_with('s')).count() > 15, "{told:?}");
+}

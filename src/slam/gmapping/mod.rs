@@ -12,6 +12,7 @@ pub mod prepared_scan;
 pub mod random;
 pub mod resampling;
 pub mod scan_matcher;
+pub mod state;
 pub mod trajectory;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -21,6 +22,7 @@ use nalgebra::Matrix3;
 use rayon::iter::{
     IndexedParallelIterator as _, IntoParallelRefMutIterator as _, ParallelIterator as _,
 };
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use self::output_map::OutputMap;
@@ -64,7 +66,7 @@ pub struct ThreadsError {
 const HISTORY: u32 = 400;
 
 /// The filter.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct GMapping {
     parameters: Parameters,
     streams: Streams,
@@ -86,10 +88,17 @@ pub struct GMapping {
 }
 
 /// What odometry said last, and since the last processed scan.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Odometry {
     odom_from_base: Option<Pose2>,
     since_processed: Motion,
+}
+
+impl Odometry {
+    /// Every pose in it, to look whether they are numbers.
+    fn poses(&self) -> impl Iterator<Item = Pose2> {
+        self.odom_from_base.into_iter().chain(self.since_processed.poses())
+    }
 }
 
 impl GMapping {
@@ -126,6 +135,7 @@ impl GMapping {
         self.tree = TrajectoryTree::default();
         self.output = OutputMap::new(self.parameters.resolution);
         self.odometry = Odometry::default();
+        self.settled = Path::default();
         self.stamps.clear();
         self.scans_seen = 0;
     }

@@ -1,6 +1,7 @@
 //! The occupancy map of the best particle, kept up to date by what differs.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use super::super::grid::occupancy::{OccupancyMap, ScanOutline};
 use super::trajectory::{NodeId, TrajectoryTree};
@@ -9,15 +10,15 @@ use super::trajectory::{NodeId, TrajectoryTree};
 ///
 /// Moving to another trajectory takes out the scans since the common ancestor and enters those of
 /// the other branch; the original replays all scans of the run.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct OutputMap {
-    map: OccupancyMap,
+    pub(super) map: OccupancyMap,
     /// Held in the tree.
-    node: Option<NodeId>,
+    pub(super) node: Option<NodeId>,
     /// Scans that particles may still place differently; the first belongs to `first_depth`.
-    scans: VecDeque<ScanOutline>,
-    first_depth: u32,
-    corrections: u64,
+    pub(super) scans: VecDeque<Arc<ScanOutline>>,
+    pub(super) first_depth: u32,
+    pub(super) corrections: u64,
 }
 
 impl OutputMap {
@@ -42,7 +43,7 @@ impl OutputMap {
 
     /// Adds the scan of the tree's newest depth and moves to the trajectory that ends at `node`.
     pub fn extend(&mut self, tree: &mut TrajectoryTree, node: NodeId, scan: ScanOutline) {
-        self.scans.push_back(scan);
+        self.scans.push_back(Arc::new(scan));
         let shared = self.node.and_then(|old| tree.common_ancestor(old, node));
         self.corrections += u64::from(shared != self.node);
         let until_shared = |from| tree.ancestry(from).take_while(move |id| Some(*id) != shared);

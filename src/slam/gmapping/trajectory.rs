@@ -1,11 +1,14 @@
 //! The tree of the particles' trajectories: a node a pose, shared by all that descend from it.
 
+use serde::{Deserialize, Serialize};
+
 use super::super::pose::Pose2;
+use super::super::state::{StateError, ensure, ensure_poses};
 
 /// Names a node of a [`TrajectoryTree`].
 pub type NodeId = u32;
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Node {
     pose_in_map: Pose2,
     parent: Option<NodeId>,
@@ -19,7 +22,7 @@ struct Node {
 ///
 /// Nodes nobody refers to any more are reused, so the tree holds the trajectories of the living
 /// particles and no others.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryTree {
     nodes: Vec<Node>,
     unused: Vec<NodeId>,
@@ -103,6 +106,41 @@ impl TrajectoryTree {
         if let Some(parent) = self.nodes[id as usize].parent.take() {
             self.release(parent);
         }
+    }
+
+    /// Looks whether the tree can be gone on with by those who hold nodes of it; returns the depth of
+    /// its only root and of its deepest node, or `None` if no node is in use.
+    ///
+    /// # Errors
+    /// When a node or a reference leads to nothing or in a ring, or is counted wrongly.
+    pub(super) fn check(&self, holders: &[NodeId]) -> Result<Option<(u32, u32)>, StateError> {
+        let parts = "trajectories";
+        let mut used = vec![true; self.nodes.len()];
+        for id in &self.unused {
+            let slot = used.get_mut(*id as usize).ok_or(StateError::Unsound(parts))?;
+            ensure(std::mem::take(slot), parts)?;
+        }
+        let is_used = |id: NodeId| used.get(id as usize).copied().unwrap_or(false);
+        let mut references = vec![0_u32; self.nodes.len()];
+        let living = || self.nodes.iter().zip(&used).filter(|(_, used)| **used).map(|(n, _)| n);
+        for id in living().filter_map(|node| node.parent).chain(holders.iter().copied()) {
+            ensure(is_used(id), parts)?;
+            references[id as usize] += 1;
+        }
+        // A parent is one less deep, so there is no ring.
+        let follows = |node: &Node| {
+            node.parent
+                .is_none_or(|id| self.nodes[id as usize].depth.checked_add(1) == Some(node.depth))
+        };
+        let counted =
+            |(index, node): (usize, &Node)| !used[index] || node.references == references[index];
+        ensure(living().all(follows) && self.nodes.iter().enumerate().all(counted), parts)?;
+        ensure(living().all(|node| node.references > 0), parts)?;
+        ensure_poses(living().map(|node| node.pose_in_map), "the pose of a trajectory")?;
+        let mut roots = living().filter(|node| node.parent.is_none()).map(|node| node.depth);
+        let Some(root) = roots.next() else { return Ok(None) };
+        ensure(roots.next().is_none(), parts)?;
+        Ok(Some((root, living().map(|node| node.depth).fold(root, u32::max))))
     }
 
     /// Nodes in use.

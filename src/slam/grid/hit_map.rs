@@ -1,11 +1,13 @@
 //! The original's particle map: for each cell, how many beams ended in it and where on average.
 
+use serde::{Deserialize, Serialize};
+
 use super::tile_map::TileMap;
 use super::{Cell, floor};
 
 /// The hits of one cell. The mean is kept relative to the cell, so it is as exact far from the
 /// frame's origin as near it (the original sums world coordinates in single precision).
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Hits {
     /// Beams that ended in the cell.
     pub count: u32,

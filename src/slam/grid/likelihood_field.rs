@@ -46,6 +46,11 @@ impl LikelihoodField {
         Self { pairs: TileMap::new() }
     }
 
+    /// The field with these tiles.
+    pub(in super::super) const fn of_tiles(pairs: TileMap<u8>) -> Self {
+        Self { pairs }
+    }
+
     /// The level of one cell, from 0 to [`FULL`].
     #[must_use]
     pub fn get(&self, cell: Cell) -> u8 {

@@ -4,6 +4,8 @@
 //! clamped on both sides, so that a cell turns as quickly from free to occupied as back; the
 //! original of Hector has no lower clamp.
 
+use serde::{Deserialize, Serialize};
+
 use super::super::pose::{Point2, Pose2};
 use super::Cell;
 use super::occupancy::{ScanOutline, Scratch};
@@ -16,8 +18,16 @@ pub const CLAMP: f64 = 4.0;
 const LIMIT: i16 = (CLAMP * STEPS) as i16;
 
 /// ln(p / (1 - p)) in steps of 1/4096; 0 is unknown.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "i16")]
 pub struct LogOdds(i16);
+
+impl From<i16> for LogOdds {
+    /// So many steps, clamped.
+    fn from(steps: i16) -> Self {
+        Self(steps.clamp(-LIMIT, LIMIT))
+    }
+}
 
 impl LogOdds {
     /// The log-odds of the probability `p`, above 0 and below 1, clamped.
@@ -99,7 +109,12 @@ impl LogOddsMap {
     /// An unknown world in cells of `resolution` metres.
     #[must_use]
     pub fn new(resolution: f64) -> Self {
-        Self { resolution, cells: TileMap::new(), scratch: Scratch::default() }
+        Self::of_cells(resolution, TileMap::new())
+    }
+
+    /// The map with these cells.
+    pub(in super::super) fn of_cells(resolution: f64, cells: TileMap<LogOdds>) -> Self {
+        Self { resolution, cells, scratch: Scratch::default() }
     }
 
     /// Metres a cell.

@@ -6,6 +6,8 @@
 use std::f64::consts::TAU;
 use std::iter::Peekable;
 
+use serde::{Deserialize, Serialize};
+
 use super::super::pose::{Point2, Pose2};
 use super::tile_map::{TILE_SIZE, Tile, TileKey, TileMap, index_in_tile};
 use super::{Cell, floor};
@@ -14,7 +16,7 @@ use super::{Cell, floor};
 const WIDEST_WEDGE: f64 = 0.6;
 
 /// How often a cell was seen.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Count {
     /// Scans in which a beam ended in the cell.
     pub hits: u32,
@@ -41,7 +43,7 @@ impl OccupiedThreshold {
 }
 
 /// Where a beam ends.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct BeamEnd {
     /// Metres in the base frame.
     pub point: [f32; 2],
@@ -50,7 +52,7 @@ pub struct BeamEnd {
 }
 
 /// What a beam says about its end and the way there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum BeamEndKind {
     /// Free up to an obstacle.
     Hit,
@@ -61,7 +63,7 @@ pub enum BeamEndKind {
 }
 
 /// A scan as the occupancy map takes it: beam ends in the order of their angles.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ScanOutline {
     /// The sensor in the base frame.
     pub sensor: Point2,
@@ -132,7 +134,12 @@ impl OccupancyMap {
     /// An empty map of cells of `resolution` metres.
     #[must_use]
     pub fn new(resolution: f64) -> Self {
-        Self { resolution, counts: TileMap::new(), scratch: Scratch::default() }
+        Self::of_counts(resolution, TileMap::new())
+    }
+
+    /// The map with these counts.
+    pub(in super::super) fn of_counts(resolution: f64, counts: TileMap<Count>) -> Self {
+        Self { resolution, counts, scratch: Scratch::default() }
     }
 
     /// Metres a cell.

@@ -3,8 +3,11 @@
 //! Tiles are gathered in pages, so that a clone of the map copies one short list of pages and a
 //! write copies at most one page of pointers and one tile.
 
+pub mod saved;
+
 use std::collections::{BTreeSet, HashSet};
 
+use serde::{Deserialize, Serialize};
 use triomphe::Arc;
 
 use super::Cell;
@@ -21,7 +24,7 @@ const PAGE_SHIFT: u32 = PAGE_SIZE.trailing_zeros();
 pub type Tile<C> = [C; TILE_CELLS];
 
 /// Which tile: cell coordinates divided by [`TILE_SIZE`], rounded down; rows order first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct TileKey {
     /// Row of tiles.
     pub ty: i32,
@@ -248,7 +251,7 @@ impl<'a, C: Copy + Default> Window<'a, C> {
 }
 
 /// How many tiles some maps refer to, and how many there are when shared ones count once.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct TileCounts {
     /// References to tiles, summed over the maps.
     pub referenced: usize,

@@ -12,9 +12,11 @@ mod parameters;
 pub mod prediction;
 pub mod prepared_scan;
 pub mod pyramid;
+pub mod state;
 pub mod weakness;
 
 use nalgebra::Matrix3;
+use serde::{Deserialize, Serialize};
 
 use self::matcher::Placed;
 pub use self::parameters::Parameters;
@@ -33,7 +35,7 @@ use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, Skip
 const RENEWAL: f64 = 0.1;
 
 /// The engine.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Hector {
     parameters: Parameters,
     directions: Directions,
@@ -47,7 +49,7 @@ pub struct Hector {
 }
 
 /// Where the robot was at the last processed scan.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct State {
     stamp: Stamp,
     pose_in_map: Pose2,
@@ -61,7 +63,7 @@ struct State {
 }
 
 /// What odometry said last, and since the last processed scan.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Odometry {
     odom_from_base: Option<Pose2>,
     since_processed: Motion,
@@ -284,7 +286,7 @@ impl Odometry {
 }
 
 /// The map that is handed out, brought up to date when it is asked for.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Output {
     map: OccupancyMap,
     /// Tiles that have changed since, some more than once.

@@ -1,7 +1,7 @@
 //! Maps of the same world in cells of growing size, each updated with every scan that enters.
 
 use super::super::grid::log_odds::{Evidence, LogOdds, LogOddsMap, Probabilities};
-use super::super::grid::tile_map::{TileCounts, TileKey};
+use super::super::grid::tile_map::{TileCounts, TileKey, TileMap};
 use super::super::pose::Pose2;
 use super::Parameters;
 use super::gauss_newton::Level;
@@ -35,6 +35,18 @@ impl Pyramid {
     #[must_use]
     pub fn finest(&self) -> &LogOddsMap {
         &self.maps[0]
+    }
+
+    /// The cells of all maps, finest first.
+    pub(super) fn cells(&self) -> impl Iterator<Item = &TileMap<LogOdds>> {
+        self.maps.iter().map(LogOddsMap::cells)
+    }
+
+    /// Takes the cells of all maps, finest first.
+    pub(super) fn set_cells(&mut self, cells: Vec<TileMap<LogOdds>>) {
+        for (map, cells) in self.maps.iter_mut().zip(cells) {
+            *map = LogOddsMap::of_cells(map.resolution(), cells);
+        }
     }
 
     /// Enters a scan taken with the base at `pose_in_map` in each map; `touched` is called with

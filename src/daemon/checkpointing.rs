@@ -1,0 +1,366 @@
+//! The state on disk: when it is written, on a thread of its own, and which one is gone on from.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+use tokio::sync::oneshot;
+
+use super::command::Done;
+use super::keys::Prefix;
+use super::mapper::Mapper;
+use super::mapper::state::MapperState;
+use crate::checkpoint::{self, Head, MapSize, Opened, Refusal, Store, StoreError, checkpoints};
+use crate::clock::{self, Stopwatch};
+use crate::config::{self, Config, EngineKind};
+use crate::files::WriteError;
+use crate::slam::engine::Engine;
+use crate::slam::pose::Stamp;
+use crate::slam::state::EngineState;
+
+/// While one is being written, it is looked so often whether the next can be.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// The body of a checkpoint.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Checkpoint {
+    /// What the engine knows.
+    pub engine: EngineState,
+    /// What is known beside it.
+    pub mapper: MapperState,
+}
+
+impl Checkpoint {
+    /// Its bytes.
+    ///
+    /// # Errors
+    /// When memory does not take them.
+    pub fn encode(&self) -> Result<Vec<u8>, postcard::Error> {
+        postcard::to_stdvec(self)
+    }
+
+    /// Of the body of a checkpoint.
+    ///
+    /// # Errors
+    /// When the body cannot be inflated or is not the state of a daemon.
+    pub fn decode(opened: &Opened<'_>) -> Result<Self, Refusal> {
+        postcard::from_bytes(&opened.body()?).map_err(|e| Refusal::Undecodable(e.to_string()))
+    }
+}
+
+/// How it goes with checkpoints.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CheckpointStatus {
+    /// Where they are.
+    pub directory: PathBuf,
+    /// The one that was gone on from; `null` if mapping began anew.
+    pub resumed_from: Option<String>,
+    /// Of the last scan that was taken before that one: who feeds again begins after it.
+    pub resumed_stamp: Option<Stamp>,
+    /// Those that were not taken, newest first.
+    pub refused: Vec<RefusedCheckpoint>,
+    /// How many have been written.
+    pub written: u64,
+    /// The last that was; `null` before the first.
+    pub last: Option<WrittenCheckpoint>,
+    /// Why the last could not be written; `null` if it could.
+    pub error: Option<String>,
+}
+
+/// A checkpoint that is not gone on from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct RefusedCheckpoint {
+    /// Its name.
+    pub file: String,
+    /// Why, in a sentence.
+    pub reason: String,
+}
+
+/// A checkpoint that is on the disk.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct WrittenCheckpoint {
+    /// Its name.
+    pub file: String,
+    /// Of the last scan that was taken.
+    pub stamp: Option<Stamp>,
+    /// Scans that had their verdict.
+    pub scans: u64,
+    /// Its size.
+    pub bytes: usize,
+    /// What it took to make and to write it.
+    pub milliseconds: f64,
+}
+
+/// The status, as the thread and those who ask share it.
+pub(super) type SharedStatus = Arc<Mutex<CheckpointStatus>>;
+
+/// Why there is nothing to write with.
+#[derive(Debug, Error)]
+pub enum CheckpointsError {
+    /// The directory cannot be used.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The thread does not start.
+    #[error("cannot start the thread that writes checkpoints")]
+    Thread(#[source] std::io::Error),
+}
+
+/// Why a checkpoint is not on the disk.
+#[derive(Debug, Error)]
+enum NotWritten {
+    #[error("the state cannot be encoded: {0}")]
+    Encode(#[from] postcard::Error),
+    #[error("the state cannot be compressed: {0}")]
+    Seal(std::io::Error),
+    #[error("{error}: {}", error.source)]
+    Write {
+        #[from]
+        error: WriteError,
+    },
+}
+
+/// Decides when the state is written, and hands it to the thread `checkpoint`.
+#[derive(Debug)]
+pub(super) struct Keeper {
+    jobs: Sender<Job>,
+    /// Jobs that are not done yet.
+    pending: Arc<AtomicUsize>,
+    every: Duration,
+    every_scans: u64,
+    /// When the last was handed on, and the scans that had their verdict by then.
+    last: (Instant, u64),
+    /// Whether a command changed the state since.
+    commanded: bool,
+}
+
+/// A state to be written. What is costly is done on the thread.
+#[derive(Debug)]
+struct Job {
+    engine: Engine,
+    mapper: MapperState,
+    done: Option<oneshot::Sender<Done>>,
+}
+
+impl Keeper {
+    /// Notes that a command changed what is known.
+    pub(super) fn note_command(&mut self) {
+        self.commanded = true;
+    }
+
+    /// Whether the state is to be written now, with so many scans that had their verdict.
+    pub(super) fn is_due(&self, now: Instant, scans: u64) -> bool {
+        let (since, before) = self.last;
+        let late = scans != before && now >= since + self.every;
+        (late || self.is_pressing(scans)) && self.pending.load(Ordering::Acquire) == 0
+    }
+
+    /// Whether it is to be written as soon as the one before is.
+    fn is_pressing(&self, scans: u64) -> bool {
+        self.commanded || scans.saturating_sub(self.last.1) >= self.every_scans
+    }
+
+    /// When to look again though nothing comes; `None` if nothing has changed.
+    pub(super) fn deadline(&self, now: Instant, scans: u64) -> Option<Instant> {
+        let (since, before) = self.last;
+        let soon = now + LOOK;
+        if self.is_pressing(scans) {
+            return Some(soon);
+        }
+        (scans != before).then(|| soon.max(since + self.every))
+    }
+
+    /// Hands a state to the thread; `done` hears when it is on the disk.
+    pub(super) fn write(
+        &mut self,
+        engine: Engine,
+        mapper: MapperState,
+        done: Option<oneshot::Sender<Done>>,
+    ) {
+        self.last = (clock::now(), mapper.scans());
+        self.commanded = false;
+        self.pending.fetch_add(1, Ordering::AcqRel);
+        // The thread ends with the keeper, never before.
+        self.jobs.send(Job { engine, mapper, done }).ok();
+    }
+}
+
+/// Goes on from the newest checkpoint that is good, if the configuration has a directory for them,
+/// and has the mapper write there.
+pub(super) fn attach(
+    mapper: &mut Mapper,
+    config: &Config,
+    prefix: &Prefix,
+) -> Result<Option<SharedStatus>, CheckpointsError> {
+    let Some(directory) = &config.raw.state_directory else { return Ok(None) };
+    let config::Checkpoint { every_s, every_scans, keep } = config.raw.checkpoint;
+    let store = Store::new(directory.as_ref(), keep)?;
+    let own = own_head(config, prefix);
+    let status = resume(mapper, store.directory(), &own);
+    let status = Arc::new(Mutex::new(status));
+    let (jobs, waiting) = channel();
+    let pending = Arc::new(AtomicUsize::new(0));
+    let writer = Writer { store, own, status: Arc::clone(&status), pending: Arc::clone(&pending) };
+    let thread = std::thread::Builder::new().name("checkpoint".to_owned());
+    thread.spawn(move || writer.run(&waiting)).map_err(CheckpointsError::Thread)?;
+    let every = Duration::from_secs_f64(every_s);
+    let last = (clock::now(), mapper.scans());
+    mapper.keep_state(Keeper { jobs, pending, every, every_scans, last, commanded: false });
+    Ok(Some(status))
+}
+
+/// What this daemon writes, without what changes from one checkpoint to the next.
+fn own_head(config: &Config, prefix: &Prefix) -> Head {
+    let engine = match config.raw.engine {
+        EngineKind::Gmapping => "gmapping",
+        EngineKind::Hector => "hector",
+        EngineKind::KnownPoses => "known_poses",
+    };
+    Head {
+        gmapd: env!("CARGO_PKG_VERSION").to_owned(),
+        robot: prefix.to_string(),
+        engine: engine.to_owned(),
+        settings: config.settings_of_state(),
+        scans: 0,
+        processed: 0,
+        particles: 0,
+        stamp: None,
+        map: None,
+        body_bytes: 0,
+    }
+}
+
+/// Goes on from the newest checkpoint that is good and of this daemon's kind.
+fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus {
+    let mut status = CheckpointStatus {
+        directory: directory.to_owned(),
+        resumed_from: None,
+        resumed_stamp: None,
+        refused: Vec::new(),
+        written: 0,
+        last: None,
+        error: None,
+    };
+    for (_, path) in checkpoints(directory) {
+        match resume_from(mapper, &path, own) {
+            Ok(head) => {
+                let (path, scans) = (path.display(), head.processed);
+                tracing::info!("going on from {path}, with {scans} scans in the map");
+                status.resumed_stamp = head.stamp;
+                status.resumed_from = Some(name(&path.to_string()));
+                break;
+            }
+            Err(refusal) => {
+                tracing::warn!("{} is not gone on from: {refusal}", path.display());
+                let file = name(&path.display().to_string());
+                status.refused.push(RefusedCheckpoint { file, reason: refusal.to_string() });
+            }
+        }
+    }
+    if status.resumed_from.is_none() {
+        tracing::info!("no state to go on from in {}: mapping begins anew", directory.display());
+    }
+    status
+}
+
+fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Refusal> {
+    let bytes = checkpoint::read(path)?;
+    let opened = checkpoint::open(&bytes)?;
+    opened.head.check_against(own)?;
+    let Checkpoint { engine, mapper: state } = Checkpoint::decode(&opened)?;
+    mapper.go_on_from(state, engine).map_err(|e| Refusal::Undecodable(e.to_string()))?;
+    Ok(opened.head)
+}
+
+/// A file's name without its directory.
+fn name(path: &str) -> String {
+    path.rsplit('/').next().unwrap_or_default().to_owned()
+}
+
+/// What the thread `checkpoint` works with.
+struct Writer {
+    store: Store,
+    own: Head,
+    status: SharedStatus,
+    pending: Arc<AtomicUsize>,
+}
+
+impl Writer {
+    /// Until the mapper ends.
+    fn run(mut self, jobs: &Receiver<Job>) {
+        self.store.adopt(&self.own);
+        while let Ok(Job { engine, mapper, done }) = jobs.recv() {
+            let written = self.write(engine, mapper);
+            let told = self.note(written);
+            self.pending.fetch_sub(1, Ordering::AcqRel);
+            // Whoever asked may be gone.
+            done.map(|done| done.send(told).ok());
+        }
+    }
+
+    fn write(
+        &mut self,
+        engine: Engine,
+        mapper: MapperState,
+    ) -> Result<WrittenCheckpoint, NotWritten> {
+        let watch = Stopwatch::start();
+        let (stamp, scans) = (mapper.taken(), mapper.scans());
+        let (head, state) = self.describe(engine, &mapper);
+        let body = Checkpoint { engine: state, mapper }.encode()?;
+        let sealed = checkpoint::seal(head, &body).map_err(NotWritten::Seal)?;
+        let path = self.store.write(&sealed)?;
+        Ok(WrittenCheckpoint {
+            file: name(&path.display().to_string()),
+            stamp,
+            scans,
+            bytes: sealed.len(),
+            milliseconds: watch.elapsed().wall.as_secs_f64() * 1e3,
+        })
+    }
+
+    fn describe(&self, mut engine: Engine, mapper: &MapperState) -> (Head, EngineState) {
+        let map = engine.occupancy_grid().map(|grid| MapSize {
+            width: grid.width,
+            height: grid.height,
+            resolution: grid.resolution,
+        });
+        let head = Head {
+            scans: mapper.scans(),
+            processed: engine.path().len() as u64,
+            particles: engine.hypotheses().len() as u64,
+            stamp: mapper.taken(),
+            map,
+            ..self.own.clone()
+        };
+        (head, engine.state())
+    }
+
+    /// Puts it in the status, and in the log where it is new that something is wrong or right.
+    fn note(&self, written: Result<WrittenCheckpoint, NotWritten>) -> Done {
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        match written {
+            Ok(written) => {
+                if status.error.take().is_some() {
+                    tracing::info!("checkpoints are written again");
+                }
+                let WrittenCheckpoint { file, bytes, milliseconds, .. } = &written;
+                tracing::debug!(file, bytes, milliseconds, "checkpoint");
+                let done = format!("the state is in {}", status.directory.join(file).display());
+                status.written += 1;
+                status.last = Some(written);
+                Done { done, changed: true }
+            }
+            Err(error) => {
+                let done = format!("the state is not written: {error}");
+                if status.error.as_ref() != Some(&done) {
+                    tracing::error!("{done}; mapping goes on");
+                    status.error = Some(done.clone());
+                }
+                Done { done, changed: false }
+            }
+        }
+    }
+}
