@@ -98,6 +98,8 @@ pub(crate) enum Mouse {
     Pressed,
     Moved,
     Released,
+    /// Turned away from the user.
+    Wheel,
 }
 
 /// A page, and the browser that it is alone in.
@@ -147,10 +149,10 @@ impl Page {
     }
 
     pub(crate) fn mouse(&mut self, what: Mouse, (x, y): (u32, u32)) {
-        let (button, buttons) = ("left", u32::from(!matches!(what, Mouse::Released)));
+        let button = if matches!(what, Mouse::Wheel) { "none" } else { "left" };
         let event = json!({
             "type": format!("mouse{what:?}"), "x": x, "y": y, "button": button,
-            "buttons": buttons, "clickCount": 1,
+            "clickCount": 1, "deltaX": 0, "deltaY": -1000,
         });
         self.call("Input.dispatchMouseEvent", &event);
     }

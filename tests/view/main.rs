@@ -291,6 +291,17 @@ fn the_page_shows_a_robot_until_it_is_gone() {
     );
     page.screenshot("desktop");
 
+    page.click("[data-tool=measure]");
+    page.mouse(Mouse::Pressed, (700, 500));
+    page.mouse(Mouse::Moved, (900, 500));
+    page.until("/^1[0-9]\\.[0-9]{2} m$/.test(said.textContent)");
+    page.mouse(Mouse::Released, (900, 500));
+    page.click("[data-tool=measure]");
+    page.mouse(Mouse::Wheel, (700, 400));
+    page.until("document.querySelector('#scale').textContent === '50 cm'");
+    page.click("#fit");
+    page.until("parseInt(document.querySelector('#scale').textContent) === 5");
+
     // From below to above: the robot looks up there.
     page.click("[data-tool=initial_pose]");
     page.mouse(Mouse::Pressed, (700, 500));
