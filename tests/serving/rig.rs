@@ -15,6 +15,7 @@ use gmapd::daemon::status::{FilterStatus, Status};
 use gmapd::ros;
 use gmapd::slam::gmapping::{GMapping, ScanReport, ScanUpdate};
 use gmapd::slam::grid::occupancy::OccupiedThreshold;
+use gmapd::slam::known_map::Mode;
 use gmapd::slam::pose::{Point2, Pose2};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::{broadcast, mpsc, watch};

@@ -14,8 +14,6 @@ pub mod prepared_scan;
 pub mod pyramid;
 pub mod weakness;
 
-use std::sync::Arc;
-
 use nalgebra::Matrix3;
 
 use self::matcher::Placed;
@@ -59,7 +57,7 @@ pub struct Hector {
 #[derive(Debug, Default)]
 struct Beginning {
     /// The map that is known before the first scan.
-    known: Option<Arc<KnownMap>>,
+    known: Option<Box<KnownMap>>,
     /// Why the last scan could not be the first one.
     obstacle: Option<NotLocalized>,
 }
@@ -106,7 +104,7 @@ impl Hector {
 
     /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
     /// is searched for.
-    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
+    pub fn begin_on(&mut self, known: Box<KnownMap>) {
         let Self { pyramid, output, .. } = self;
         pyramid.enter(known.cells(), |tile| output.stale.push(tile));
         self.beginning = Beginning { known: Some(known), obstacle: None };
@@ -233,7 +231,7 @@ impl Hector {
 
     /// Searches the known map, if there is one, for where the first scan was taken.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &self.beginning.known else { return Ok(()) };
+        let Some(known) = &mut self.beginning.known else { return Ok(()) };
         if self.parameters.initial_pose.is_none() {
             match known.find(&scan.outline, None) {
                 Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
