@@ -769,7 +769,8 @@ async fn who_is_not_localized_says_why_until_a_pose_is_given() {
     rig.feed(&moments[2]).await;
     assert_eq!(rig.verdicts(1).await, [Verdict::Processed]);
     assert_eq!(rig.daemon.status().state, State::Mapping);
-    assert_eq!(path(&rig.end().await).len(), 1);
+    let last = rig.end().await;
+    assert_eq!(path(&last).len(), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]
