@@ -56,6 +56,7 @@ mod tests {
     use super::*;
     use crate::daemon::ledger::Verdict;
     use crate::daemon::status::FilterStatus;
+    use crate::slam::known_map::Mode;
     use crate::slam::pose::Pose2;
     use crate::statistics::Spread;
 
@@ -64,6 +65,7 @@ mod tests {
             version: "0.0.0",
             uptime_s: 1.0,
             state,
+            mode: Mode::Mapping,
             detail: "no scan has come".to_owned(),
             pose_in_map: Pose2::IDENTITY,
             scans: BTreeMap::from([(Verdict::Processed, 3), (Verdict::NoOdometry, 2)]),

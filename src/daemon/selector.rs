@@ -115,11 +115,8 @@ impl Topic {
     /// Whether asking changes something, so that it must not happen by a wildcard.
     #[must_use]
     pub const fn is_command(self) -> bool {
-        match self {
-            Self::Reset | Self::Pause | Self::Resume => true,
-            Self::InitialPose | Self::Mode | Self::Save => true,
-            _ => false,
-        }
+        let changes_state = matches!(self, Self::Reset | Self::Pause | Self::Resume | Self::Mode);
+        changes_state || matches!(self, Self::InitialPose | Self::Save)
     }
 
     /// Whether the answer may be megabytes, which take their time on the network.
