@@ -15,12 +15,14 @@ use gmapd::daemon::ledger::{Entry, Verdict};
 use gmapd::daemon::snapshot::{Snapshot, State};
 use gmapd::daemon::{self, Daemon, Settings};
 use gmapd::logs::Reading;
+use gmapd::map;
 use gmapd::replay::Replay;
 use gmapd::ros::{self, Message};
 use gmapd::sim::{Place, Scenario, Simulation};
 use gmapd::slam::deskew::Velocity;
 use gmapd::slam::gmapping::{GMapping, ScanReading};
 use gmapd::slam::grid::occupancy::OccupancyGrid;
+use gmapd::slam::known_map::Mode;
 use gmapd::slam::path::Path;
 use gmapd::slam::pose::{Pose2, Stamp};
 use gmapd::slam::scan::{LaserMount, Scan};
@@ -735,6 +737,80 @@ async fn an_initial_pose_before_the_first_scan_is_where_the_map_begins() {
     rig.verdict().await;
     let snapshot = rig.end().await;
     assert_eq!(path(&snapshot).iter().next().unwrap().1, place);
+}
+
+/// Saves a map in a folder; what makes a daemon start from it.
+fn start_from(folder: &std::path::Path, grid: &OccupancyGrid) -> String {
+    std::fs::write(folder.join("map.pgm"), map::pgm(grid)).unwrap();
+    std::fs::write(folder.join("map.yaml"), map::yaml(grid, "map.pgm")).unwrap();
+    format!("map={}", folder.join("map.yaml").display())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_map_to_start_from_is_told_frozen_and_thawed_by_command() {
+    let moments = drive(120);
+    let (mapped, _) = replayed(&settings(&[]), &moments[..60]);
+    let folder = tempfile::tempdir().unwrap();
+    let map = start_from(folder.path(), mapped.as_ref().unwrap());
+    let mut rig = Rig::mounted(&[&map, "mode=localization"]).await;
+    let first = rig.daemon.snapshots().borrow().clone();
+    assert_eq!((grid(&first), path(&first).len()), (mapped.clone(), 0), "before any scan");
+    let mut verdicts = Vec::new();
+    for moment in &moments[..60] {
+        rig.feed(moment).await;
+        verdicts.extend(rig.verdicts(1).await);
+    }
+    assert_eq!(verdicts[0], Verdict::Processed, "the search found the beginning");
+    let status = rig.daemon.status();
+    assert_eq!((status.state, status.mode), (State::Localizing, Mode::Localization));
+    assert!(!rig.command(Command::Mode(Mode::Localization)).await.changed);
+    assert!(rig.command(Command::Mode(Mode::Mapping)).await.changed);
+    let frozen = rig.daemon.snapshots().borrow().clone();
+    assert_eq!(grid(&frozen), mapped, "a whole drive has changed nothing");
+    assert!(path(&frozen).len() > 5 && frozen.map.as_ref().unwrap().epoch == 1);
+    for moment in &moments[60..] {
+        rig.feed(moment).await;
+        rig.verdict().await;
+    }
+    assert_eq!(rig.daemon.status().state, State::Mapping);
+    let last = rig.end().await;
+    assert_ne!(grid(&last), mapped);
+    let error = moments[119].odom_from_base().between(last.estimate.pose_in_map);
+    assert!(error.position().norm() < 0.3, "map is odom of the first session: {error:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_is_not_localized_says_why_until_a_pose_is_given() {
+    let moments = drive(3);
+    let folder = tempfile::tempdir().unwrap();
+    let (mapped, _) = replayed(&settings(&[]), &moments);
+    let mut empty = mapped.unwrap();
+    empty.cells.fill(0);
+    let mut rig = Rig::mounted(&[&start_from(folder.path(), &empty)]).await;
+    for moment in &moments[..2] {
+        rig.feed(moment).await;
+        let entry = rig.verdict().await;
+        assert_eq!(entry.verdict, Verdict::NotLocalized);
+        assert!(entry.detail.contains("fits nowhere"), "{}", entry.detail);
+    }
+    let status = rig.daemon.status();
+    assert_eq!(status.state, State::NotLocalized);
+    assert!(status.detail.contains("slam/cmd/initial_pose"), "{}", status.detail);
+    rig.command(Command::InitialPose(Pose2::new(1.0, 2.0, 0.5))).await;
+    rig.feed(&moments[2]).await;
+    assert_eq!(rig.verdicts(1).await, [Verdict::Processed]);
+    assert_eq!(rig.daemon.status().state, State::Mapping);
+    let last = rig.end().await;
+    assert_eq!(path(&last).len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn there_has_to_be_a_map_to_localize_in() {
+    let rig = Rig::mounted(&[]).await;
+    let done = rig.command(Command::Mode(Mode::Localization)).await;
+    assert!(!done.changed && done.done.contains("no map"), "{}", done.done);
+    assert_eq!(rig.daemon.status().mode, Mode::Mapping);
+    rig.end().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -581,7 +581,8 @@ impl Mapper {
         if mapping {
             (format!("all hypotheses are moved, so that the robot is at {place}"), true)
         } else {
-            (format!("the map will begin with the robot at {place}"), true)
+            let begins = if self.view.map.is_some() { "path" } else { "map" };
+            (format!("the {begins} will begin with the robot at {place}"), true)
         }
     }
 

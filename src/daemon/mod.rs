@@ -491,7 +491,7 @@ async fn log_changes(source: Arc<StatusSource>) {
         if last.replace(state) != Some(state) {
             match state {
                 State::Mapping | State::Localizing | State::Paused => {
-                    tracing::info!(?state, "{detail}")
+                    tracing::info!(?state, "{detail}");
                 }
                 State::WaitingForScans
                 | State::WaitingForOdometry

@@ -86,7 +86,8 @@ const fn free() -> f64 {
 /// When a file cannot be read, is not what it has to be, or the map is turned.
 pub fn read(yaml: &Path) -> Result<OccupancyGrid, MapFileError> {
     let wrong = |reason: String| MapFileError::Description { path: yaml.to_owned(), reason };
-    let text = String::from_utf8(bytes_of(yaml)?).map_err(|_| wrong("it is no text".to_owned()))?;
+    let text =
+        String::from_utf8(bytes_of(yaml)?).map_err(|error| wrong(format!("no text: {error}")))?;
     let description: Description =
         serde_saphyr::from_str(&text).map_err(|error| wrong(first_line(&error.to_string())))?;
     let Description { resolution, origin: [x, y, yaw], .. } = description;
@@ -101,12 +102,12 @@ pub fn read(yaml: &Path) -> Result<OccupancyGrid, MapFileError> {
             "origin has a yaw of {yaw} rad, and maps that are turned are not taken; turn the image"
         )));
     }
-    let negated = negated(&description.negate)
+    let dark = dark(&description.negate)
         .ok_or_else(|| wrong(format!("negate is {}; 0 or 1 is needed", description.negate)))?;
     let image = yaml.parent().unwrap_or(Path::new("")).join(&description.image);
     let pixels = Pixels::parse(&bytes_of(&image)?)
         .map_err(|reason| MapFileError::Image { path: image, reason: reason.to_owned() })?;
-    let cell = |&pixel: &u8| description.cell(pixel, pixels.white, negated);
+    let cell = |&pixel: &u8| description.cell(pixel, pixels.white, dark);
     Ok(OccupancyGrid {
         resolution,
         width: pixels.width,
@@ -125,26 +126,37 @@ fn first_line(text: &str) -> String {
     text.lines().next().unwrap_or_default().to_owned()
 }
 
+/// What dark pixels are.
+#[derive(Debug, Clone, Copy)]
+enum Dark {
+    Occupied,
+    /// `negate: 1`.
+    Free,
+}
+
 /// Both 0 and 1, and false and true, are written.
-fn negated(value: &serde_json::Value) -> Option<bool> {
-    match value {
-        serde_json::Value::Null => Some(false),
-        serde_json::Value::Bool(negated) => Some(*negated),
+fn dark(negate: &serde_json::Value) -> Option<Dark> {
+    match negate {
+        serde_json::Value::Null | serde_json::Value::Bool(false) => Some(Dark::Occupied),
+        serde_json::Value::Bool(true) => Some(Dark::Free),
         other => match other.as_u64()? {
-            0 => Some(false),
-            1 => Some(true),
+            0 => Some(Dark::Occupied),
+            1 => Some(Dark::Free),
             _ => None,
         },
     }
 }
 
 impl Description {
-    fn cell(&self, pixel: u8, white: u8, negated: bool) -> i8 {
+    fn cell(&self, pixel: u8, white: u8, dark: Dark) -> i8 {
         if matches!(self.mode, PixelMode::Raw) {
             return if pixel <= 100 { pixel as i8 } else { -1 };
         }
         let share = f64::from(pixel) / f64::from(white);
-        let occupied = if negated { share } else { 1.0 - share };
+        let occupied = match dark {
+            Dark::Occupied => 1.0 - share,
+            Dark::Free => share,
+        };
         if occupied > self.occupied_thresh {
             return 100;
         }

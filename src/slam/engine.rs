@@ -1,7 +1,5 @@
 //! The mapping systems, one of which runs.
 
-use std::sync::Arc;
-
 use nalgebra::Matrix3;
 
 use super::gmapping::{GMapping, Parameters, ThreadsError};
@@ -103,7 +101,7 @@ impl Engine {
     pub fn from_map(
         parameters: EngineParameters,
         threads: usize,
-        known: Arc<KnownMap>,
+        known: Box<KnownMap>,
     ) -> Result<Self, ThreadsError> {
         let mut engine = Self::new(parameters, threads)?;
         match &mut engine {

@@ -1,7 +1,5 @@
 //! A map that mapping starts from, and whether maps grow at all.
 
-use std::sync::OnceLock;
-
 use serde::{Deserialize, Serialize};
 
 use super::grid::Cell;
@@ -31,7 +29,7 @@ pub struct KnownMap {
     /// The cell of the map that has the grid's first cell, most of it.
     first: Cell,
     /// Made when a pose is searched for.
-    search: OnceLock<SearchMap>,
+    search: Option<SearchMap>,
 }
 
 impl KnownMap {
@@ -44,7 +42,7 @@ impl KnownMap {
     pub fn new(grid: OccupancyGrid, threshold: OccupiedThreshold) -> Self {
         let nearest = |metres: f64| libm::round(metres / grid.resolution) as i32;
         let first = Cell::new(nearest(grid.origin.x), nearest(grid.origin.y));
-        Self { grid, threshold, first, search: OnceLock::new() }
+        Self { grid, threshold, first, search: None }
     }
 
     /// Metres a cell.
@@ -88,18 +86,20 @@ impl KnownMap {
         self.first
     }
 
-    /// Where a scan was taken; `pool` may help.
+    /// Where a scan was taken; `pool` may help. The first search makes the map ready.
     ///
     /// # Errors
     /// When it fits nowhere, or at two places.
     pub fn find(
-        &self,
+        &mut self,
         scan: &ScanOutline,
         pool: Option<&rayon::ThreadPool>,
     ) -> Result<Place, NotLocalized> {
         let hits = scan.ends.iter().filter(|end| end.kind == BeamEndKind::Hit);
         let hits: Vec<[f32; 2]> = hits.map(|end| end.point).collect();
-        let search = self.search.get_or_init(|| SearchMap::new(&self.grid, self.occupied_above()));
+        let occupied_above = self.occupied_above();
+        let Self { grid, search, .. } = self;
+        let search = search.get_or_insert_with(|| SearchMap::new(grid, occupied_above));
         search.find(&hits, pool)
     }
 

@@ -10,6 +10,7 @@ use gmapd::daemon::snapshot::{MapVersion, Snapshot};
 use gmapd::map;
 use gmapd::ros;
 use gmapd::slam::grid::occupancy::{OccupancyGrid, OccupiedThreshold};
+use gmapd::slam::known_map::Mode;
 use gmapd::slam::pose::{Pose2, Stamp};
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tokio::task::JoinSet;
@@ -216,6 +217,8 @@ async fn what_makes_no_sense_is_named_and_what_is_allowed_is_listed() {
         ("slam/cmd/reset?x=1;y=2", ["yaw", "missing"]),
         ("slam/cmd/initial_pose", ["x and y in metres", "yaw in radians"]),
         ("slam/cmd/initial_pose?x=far;y=2;yaw=0", ["\"far\"", "metres"]),
+        ("slam/cmd/mode", ["mode=mapping", "mode=localization"]),
+        ("slam/cmd/mode?mode=frozen", ["\"frozen\"", "mapping, localization"]),
         ("slam/cmd/save?name=../../etc/passwd", ["\"../../etc/passwd\"", "slash"]),
         ("slam/cmd/save?name=", ["\"\"", "is empty"]),
     ] {
@@ -253,6 +256,8 @@ async fn commands_reach_the_filter_and_its_answer_comes_back() {
         ("pause", Command::Pause),
         ("resume", Command::Resume),
         ("initial_pose?x=3;y=4;yaw=-1", Command::InitialPose(Pose2::new(3.0, 4.0, -1.0))),
+        ("mode?mode=localization", Command::Mode(Mode::Localization)),
+        ("mode?mode=mapping", Command::Mode(Mode::Mapping)),
     ];
     for (selector, command) in commands {
         let client = rig.client.clone();

@@ -163,12 +163,15 @@ impl LogOddsMap {
         });
     }
 
-    /// Takes a cell as known: occupied if any part of it is said to be, else free.
-    pub fn know(&mut self, cell: Cell, occupied: bool) {
+    /// Takes a cell as occupied, at least in part.
+    pub fn know_occupied(&mut self, cell: Cell) {
+        *self.cells.get_mut(cell) = LogOdds(KNOWN);
+    }
+
+    /// Takes a cell as free, if no part of it is occupied.
+    pub fn know_free(&mut self, cell: Cell) {
         let value = self.cells.get_mut(cell);
-        if occupied {
-            *value = LogOdds(KNOWN);
-        } else if value.sign() <= 0 {
+        if value.sign() <= 0 {
             *value = LogOdds(-KNOWN);
         }
     }

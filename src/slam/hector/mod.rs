@@ -15,8 +15,6 @@ pub mod pyramid;
 pub mod state;
 pub mod weakness;
 
-use std::sync::Arc;
-
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
@@ -61,7 +59,7 @@ pub struct Hector {
 #[derive(Debug, Clone, Default)]
 struct Beginning {
     /// The map that is known before the first scan.
-    known: Option<Arc<KnownMap>>,
+    known: Option<Box<KnownMap>>,
     /// Why the last scan could not be the first one.
     obstacle: Option<NotLocalized>,
 }
@@ -108,7 +106,7 @@ impl Hector {
 
     /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
     /// is searched for.
-    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
+    pub fn begin_on(&mut self, known: Box<KnownMap>) {
         let Self { pyramid, output, .. } = self;
         pyramid.enter(known.cells(), |tile| output.stale.push(tile));
         self.beginning = Beginning { known: Some(known), obstacle: None };
@@ -235,7 +233,7 @@ impl Hector {
 
     /// Searches the known map, if there is one, for where the first scan was taken.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &self.beginning.known else { return Ok(()) };
+        let Some(known) = &mut self.beginning.known else { return Ok(()) };
         if self.parameters.initial_pose.is_none() {
             match known.find(&scan.outline, None) {
                 Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),

@@ -77,7 +77,12 @@ impl Pyramid {
         for (cell, occupied) in cells {
             touched(TileKey::containing(cell));
             for (level, map) in self.maps.iter_mut().enumerate() {
-                map.know(Cell::new(cell.ix >> level, cell.iy >> level), occupied);
+                let cell = Cell::new(cell.ix >> level, cell.iy >> level);
+                if occupied {
+                    map.know_occupied(cell);
+                } else {
+                    map.know_free(cell);
+                }
             }
         }
     }
