@@ -32,6 +32,10 @@ use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, Skip
 /// How much of the usual score each scan renews.
 const RENEWAL: f64 = 0.1;
 
+/// Without odometry, a scan enters the map in any case if more than this share of what it sees is
+/// new: the next ones have nothing else to go by.
+const NEWS: f64 = 0.2;
+
 /// The engine.
 #[derive(Debug)]
 pub struct Hector {
@@ -192,12 +196,14 @@ impl Hector {
     fn advance(&mut self, sweep: &Sweep<'_>, placed: &Placed) -> bool {
         let (pose_in_map, stamp) = (placed.pose_in_map, sweep.scan.stamp);
         let last = self.state.map(|state| state.registered_at);
-        let registered = last.is_none_or(|last| {
-            let moved = last.between(pose_in_map);
-            moved.position().norm() > self.parameters.update_distance
-                || moved.theta.abs() > self.parameters.update_angle
-        });
-        let velocity = self.state.and_then(|state| {
+        let registered = placed.matched
+            && last.is_none_or(|last| {
+                let moved = last.between(pose_in_map);
+                (sweep.odom_from_base.is_none() && placed.news > NEWS)
+                    || moved.position().norm() > self.parameters.update_distance
+                    || moved.theta.abs() > self.parameters.update_angle
+            });
+        let velocity = self.state.filter(|_| placed.matched).and_then(|state| {
             let seconds = stamp.seconds_since(state.stamp);
             prediction::velocity(state.pose_in_map.between(pose_in_map), seconds)
         });
