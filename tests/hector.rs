@@ -233,3 +233,69 @@ fn scans_enter_the_map_only_after_enough_motion_and_move_the_pose_before() {
     assert_eq!(registered, [true, false, true, false]);
     assert_eq!(hector.path().len(), 4);
 }
+
+/// A tour of the room without odometry, ten scans a second, and what comes after it.
+fn toured() -> (Hector, Vec<Pose2>, Stamp) {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    let poses = route(CORNER);
+    hector.set_pose(poses[0]);
+    let mut stamp = Stamp(0);
+    for shot in shots(&room(CORNER), &lidar, &poses) {
+        stamp = shot.scan.stamp;
+        let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base: None };
+        report(hector.add_scan(&sweep, &mut |_| ()));
+    }
+    (hector, poses, stamp)
+}
+
+/// The robot stands still, and then was moved by `away`, while a tenth of a second passed.
+fn after_a_jolt(away: Pose2) -> (ScanReport, Pose2) {
+    let lidar = full_circle(360);
+    let (mut hector, poses, start) = toured();
+    let stands = *poses.last().expect("the tour has poses");
+    let truths = [stands, stands, stands, stands * away];
+    let mut last = None;
+    for (step, shot) in (1..).zip(shots(&room(CORNER), &lidar, &truths)) {
+        let scan = Scan { stamp: Stamp(start.0 + step * 100_000_000), ..shot.scan };
+        let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+        last = Some(report(hector.add_scan(&sweep, &mut |_| ())));
+    }
+    (last.expect("four scans"), (stands * away).between(hector.pose_in_map()))
+}
+
+#[test]
+fn without_odometry_a_jolt_does_not_lose_the_robot() {
+    for away in [Pose2::new(0.5, -0.3, 0.7), Pose2::new(-0.4, 0.4, -0.6)] {
+        let (report, error) = after_a_jolt(away);
+        assert_eq!(report.matched, 1);
+        assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{error:?}");
+    }
+}
+
+#[test]
+fn a_scan_that_fits_nowhere_does_not_enter_the_map() {
+    let lidar = full_circle(360);
+    let (mut hector, poses, start) = toured();
+    let before = hector.occupancy().clone();
+    let stands = *poses.last().expect("the tour has poses");
+    let [good] = shots(&room(CORNER), &lidar, &[stands]).try_into().expect("one scan");
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for step in 1..=10 {
+        let stamp = Stamp(start.0 + step * 100_000_000);
+        let ranges = (0..360).map(|_| rng.random_range(0.5..1.5)).collect();
+        let scan = Scan { stamp, geometry: lidar.geometry, ranges };
+        let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+        let report = report(hector.add_scan(&sweep, &mut |_| ()));
+        assert_eq!((report.matched, report.registered), (0, false));
+    }
+    assert_eq!(hector.occupancy().counts().tiles().count(), before.counts().tiles().count());
+    for (key, tile) in before.counts().tiles() {
+        assert_eq!(hector.occupancy().counts().tile(key), Some(tile));
+    }
+    let scan = Scan { stamp: Stamp(start.0 + 1_100_000_000), ..good.scan };
+    let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+    assert_eq!(report(hector.add_scan(&sweep, &mut |_| ())).matched, 1);
+    let error = stands.between(hector.pose_in_map());
+    assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{error:?}");
+}

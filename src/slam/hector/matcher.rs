@@ -20,8 +20,8 @@ const POOR: f64 = 0.5;
 const WORSE: f64 = 0.93;
 /// With a prediction this unsure, a search follows in any case.
 const VERY_POOR: f64 = 3.0;
-/// A match counts if 1 - (1 - M)² is at least this on average over the points, in the coarsest map,
-/// which is dense; where nothing is known it is 0.75.
+/// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
+/// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
 const LEAST_EXPLAINED: f64 = 0.7;
 /// What a residual weighs beside the prediction: 1 / its variance.
 const GAIN: f64 = 1.0;
@@ -143,7 +143,8 @@ impl Matcher<'_> {
         Placed {
             pose_in_map: pose,
             covariance: information.try_inverse().unwrap_or(covariance),
-            matched: levels[0].explains(pose) >= LEAST_EXPLAINED,
+            matched: score >= LEAST_EXPLAINED * points
+                || levels[0].explains(pose) >= LEAST_EXPLAINED,
             score,
             news: levels[0].unknown_share(pose),
             ..unknown
