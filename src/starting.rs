@@ -1,6 +1,7 @@
 //! The engine as configured, on the map that it is to start from.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use thiserror::Error;
 
@@ -49,7 +50,7 @@ pub enum StartError {
 pub fn engine(config: &Config, threads: usize) -> Result<Engine, StartError> {
     let parameters = config.engine_parameters();
     let mut engine = match known_map(config)? {
-        Some(known) => Engine::from_map(parameters, threads, Box::new(known))?,
+        Some(known) => Engine::from_map(parameters, threads, Arc::new(known))?,
         None => Engine::new(parameters, threads)?,
     };
     engine.set_mode(config.raw.mode);

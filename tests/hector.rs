@@ -4,6 +4,7 @@ use gmapd::sim::lidar::Lidar;
 use gmapd::sim::{Place, Scenario, Simulation};
 use gmapd::slam::engine::Sweep;
 use gmapd::slam::grid::log_odds::{CLAMP, Evidence, LogOdds, LogOddsMap, Probabilities};
+use gmapd::slam::hector::correlation::Search;
 use gmapd::slam::hector::gauss_newton::Level;
 use gmapd::slam::hector::matcher;
 use gmapd::slam::hector::prediction::Prediction;
@@ -232,4 +233,119 @@ fn scans_enter_the_map_only_after_enough_motion_and_move_the_pose_before() {
     // The robot moves by 0.3 m from scan to scan, and 0.4 m is enough.
     assert_eq!(registered, [true, false, true, false]);
     assert_eq!(hector.path().len(), 4);
+}
+
+/// A tour of the room without odometry, ten scans a second, and what comes after it.
+fn toured() -> (Hector, Vec<Pose2>, Stamp) {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    let poses = route(CORNER);
+    hector.set_pose(poses[0]);
+    let mut stamp = Stamp(0);
+    for shot in shots(&room(CORNER), &lidar, &poses) {
+        stamp = shot.scan.stamp;
+        let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base: None };
+        report(hector.add_scan(&sweep, &mut |_| ()));
+    }
+    (hector, poses, stamp)
+}
+
+/// The robot stands still, and then was moved by `away`, while a tenth of a second passed.
+fn after_a_jolt(away: Pose2) -> (ScanReport, Pose2) {
+    let lidar = full_circle(360);
+    let (mut hector, poses, start) = toured();
+    let stands = *poses.last().expect("the tour has poses");
+    let truths = [stands, stands, stands, stands * away];
+    let mut last = None;
+    for (step, shot) in (1..).zip(shots(&room(CORNER), &lidar, &truths)) {
+        let scan = Scan { stamp: Stamp(start.0 + step * 100_000_000), ..shot.scan };
+        let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+        last = Some(report(hector.add_scan(&sweep, &mut |_| ())));
+    }
+    (last.expect("four scans"), (stands * away).between(hector.pose_in_map()))
+}
+
+#[test]
+fn without_odometry_a_jolt_does_not_lose_the_robot() {
+    for away in [Pose2::new(0.5, -0.3, 0.7), Pose2::new(-0.4, 0.4, -0.6)] {
+        let (report, error) = after_a_jolt(away);
+        assert_eq!(report.matched, 1);
+        assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{error:?}");
+    }
+}
+
+#[test]
+fn a_scan_that_fits_nowhere_does_not_enter_the_map() {
+    let lidar = full_circle(360);
+    let (mut hector, poses, start) = toured();
+    let before = hector.occupancy().clone();
+    let stands = *poses.last().expect("the tour has poses");
+    let [good] = shots(&room(CORNER), &lidar, &[stands]).try_into().expect("one scan");
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for step in 1..=10 {
+        let stamp = Stamp(start.0 + step * 100_000_000);
+        let ranges = (0..360).map(|_| rng.random_range(0.5..1.5)).collect();
+        let scan = Scan { stamp, geometry: lidar.geometry, ranges };
+        let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+        let report = report(hector.add_scan(&sweep, &mut |_| ()));
+        assert_eq!((report.matched, report.registered), (0, false));
+    }
+    assert_eq!(hector.occupancy().counts().tiles().count(), before.counts().tiles().count());
+    for (key, tile) in before.counts().tiles() {
+        assert_eq!(hector.occupancy().counts().tile(key), Some(tile));
+    }
+    let scan = Scan { stamp: Stamp(start.0 + 1_100_000_000), ..good.scan };
+    let sweep = Sweep { scan: &scan, mount: &lidar.mount, odom_from_base: None };
+    assert_eq!(report(hector.add_scan(&sweep, &mut |_| ())).matched, 1);
+    let error = stands.between(hector.pose_in_map());
+    assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{error:?}");
+}
+
+/// What a pose is worth to a search: the scan's probabilities, less the prior's cost.
+fn likelihood(search: &Search<'_>, pose: Pose2) -> f64 {
+    let [x, y] = search.level.in_window(pose);
+    let (sin, cos) = libm::sincos(pose.theta);
+    let probability = |&[px, py]: &[f32; 2]| {
+        let (px, py) = (f64::from(px), f64::from(py));
+        let (column, row) = (x + cos * px - sin * py, y + sin * px + cos * py);
+        f64::from(search.level.probability(column.floor() as i32, row.floor() as i32))
+    };
+    let mean = search.prior.pose_in_map;
+    let d = Vector3::new(pose.x - mean.x, pose.y - mean.y, wrap_angle(pose.theta - mean.theta));
+    let sum: f64 = search.level.points().iter().map(probability).sum();
+    search.gain * sum - 0.5 * d.dot(&(search.prior.information * d))
+}
+
+#[test]
+fn the_search_finds_what_trying_every_pose_finds() {
+    let (parameters, lidar) = (Parameters::default(), full_circle(120));
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let mut pyramid = Pyramid::new(&parameters);
+    let poses = route(CORNER);
+    for &pose in &poses {
+        pyramid.add(&look(&lidar, pose, &parameters, &mut rng), pose, |_| ());
+    }
+    for truth in [poses[3], poses[14]] {
+        let scan = look(&lidar, truth, &parameters, &mut rng);
+        let pose_in_map = truth * Pose2::new(0.33, -0.21, 0.17);
+        let level = pyramid.levels(&scan, pose_in_map).next().expect("the coarsest");
+        let lever = matcher::lever(&scan.hits);
+        let deviations = [0.2, 0.1];
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01));
+        let prior = Prediction { pose_in_map, covariance }.prior().expect("it has an inverse");
+        let search = Search { level: &level, prior: &prior, deviations, lever, gain: 1.0 };
+        let (cell, angle) = (level.resolution(), level.resolution() / lever);
+        let turns = (0.3 / angle) as i32;
+        let best = (-turns..=turns)
+            .flat_map(|turn| (-6..=6).flat_map(move |y| (-6..=6).map(move |x| (x, y, turn))))
+            .map(|(x, y, turn)| {
+                let moved = [x, y].map(|cells| f64::from(cells) * cell);
+                let theta = wrap_angle(pose_in_map.theta + f64::from(turn) * angle);
+                let pose = Pose2::new(pose_in_map.x + moved[0], pose_in_map.y + moved[1], theta);
+                likelihood(&search, pose)
+            })
+            .fold(f64::NEG_INFINITY, f64::max);
+        let found = likelihood(&search, search.run());
+        assert!((found - best).abs() < 1e-3, "{found} was found, and the best is {best}");
+    }
 }

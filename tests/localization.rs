@@ -242,7 +242,7 @@ fn known(grid: OccupancyGrid) -> KnownMap {
 
 #[test]
 fn the_search_finds_poses_all_over_the_room_whatever_the_threads() {
-    let mut known = known(mapped(ENGINES[0]));
+    let known = known(mapped(ENGINES[0]));
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().expect("threads start");
     let world = room(CORNER);
     for index in 0..12 {

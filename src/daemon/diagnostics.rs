@@ -70,7 +70,6 @@ mod tests {
             version: "0.0.0",
             uptime_s: 1.0,
             state,
-            mode: Mode::Mapping,
             detail: "no scan has come".to_owned(),
             pose_in_map: Pose2::IDENTITY,
             laser: None,

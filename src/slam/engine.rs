@@ -1,5 +1,7 @@
 //! The mapping systems, one of which runs.
 
+use std::sync::Arc;
+
 use nalgebra::Matrix3;
 
 use super::gmapping::{GMapping, Parameters, ThreadsError};
@@ -101,7 +103,7 @@ impl Engine {
     pub fn from_map(
         parameters: EngineParameters,
         threads: usize,
-        known: Box<KnownMap>,
+        known: Arc<KnownMap>,
     ) -> Result<Self, ThreadsError> {
         let mut engine = Self::new(parameters, threads)?;
         match &mut engine {

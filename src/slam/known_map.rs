@@ -1,5 +1,7 @@
 //! A map that mapping starts from, and whether maps grow at all.
 
+use std::sync::OnceLock;
+
 use serde::{Deserialize, Serialize};
 
 use super::grid::Cell;
@@ -29,7 +31,7 @@ pub struct KnownMap {
     /// The cell of the map that has the grid's first cell, most of it.
     first: Cell,
     /// Made when a pose is searched for.
-    search: Option<SearchMap>,
+    search: OnceLock<SearchMap>,
 }
 
 impl KnownMap {
@@ -42,7 +44,7 @@ impl KnownMap {
     pub fn new(grid: OccupancyGrid, threshold: OccupiedThreshold) -> Self {
         let nearest = |metres: f64| libm::round(metres / grid.resolution) as i32;
         let first = Cell::new(nearest(grid.origin.x), nearest(grid.origin.y));
-        Self { grid, threshold, first, search: None }
+        Self { grid, threshold, first, search: OnceLock::new() }
     }
 
     /// Metres a cell.
@@ -91,7 +93,7 @@ impl KnownMap {
     /// # Errors
     /// When it fits nowhere, or at two places.
     pub fn find(
-        &mut self,
+        &self,
         scan: &ScanOutline,
         pool: Option<&rayon::ThreadPool>,
     ) -> Result<Place, NotLocalized> {
@@ -99,7 +101,7 @@ impl KnownMap {
         let hits: Vec<[f32; 2]> = hits.map(|end| end.point).collect();
         let occupied_above = self.occupied_above();
         let Self { grid, search, .. } = self;
-        let search = search.get_or_insert_with(|| SearchMap::new(grid, occupied_above));
+        let search = search.get_or_init(|| SearchMap::new(grid, occupied_above));
         search.find(&hits, pool)
     }
 

@@ -95,7 +95,7 @@ pub struct GMapping {
 #[derive(Debug, Clone, Default)]
 struct Beginning {
     /// The map that is known before the first scan.
-    known: Option<Box<KnownMap>>,
+    known: Option<Arc<KnownMap>>,
     /// The same as particles have it.
     map: ParticleMap,
     /// Why the last scan could not be the first one.
@@ -145,7 +145,7 @@ impl GMapping {
 
     /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
     /// is searched for.
-    pub fn begin_on(&mut self, known: Box<KnownMap>) {
+    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
         self.output = OutputMap::on(known.occupancy());
         let map = self.matcher.map_of(&known);
         self.beginning = Beginning { known: Some(known), map, obstacle: None };
@@ -296,7 +296,7 @@ impl GMapping {
 
     /// Searches the known map, if there is one, for where the first scan was taken.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &mut self.beginning.known else { return Ok(()) };
+        let Some(known) = &self.beginning.known else { return Ok(()) };
         if self.parameters.initial_pose.is_some() {
             return Ok(());
         }

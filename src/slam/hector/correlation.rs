@@ -1,8 +1,10 @@
-//! Where a scan fits a coarse map, when nobody knows well: every pose of a window is tried
-//! (Olson, "Real-time correlative scan matching", ICRA 2009).
+//! Where a scan fits a coarse map, when nobody knows well: the best pose of a window (Olson,
+//! "Real-time correlative scan matching", ICRA 2009), by branch and bound over maps of maxima
+//! (Hess, Kohler, Rapp, Andor, "Real-time loop closure in 2D LIDAR SLAM", ICRA 2016).
 
+use super::super::grid::floor;
 use super::super::pose::{Pose2, wrap_angle};
-use super::gauss_newton::{Level, Prior};
+use super::gauss_newton::{Level, MARGIN, Prior};
 
 /// Hits that are looked at, at most.
 const MOST_POINTS: usize = 180;
@@ -12,6 +14,10 @@ const DEVIATIONS: f64 = 3.0;
 const NEAREST: f64 = 2.0;
 /// ... and at most this far: m and rad.
 const FURTHEST: [f64; 2] = [2.0, 1.2];
+/// A block of poses has this many blocks of the next smaller size along its side, ...
+const BRANCHES: i32 = 4;
+/// ... and blocks have so many sizes; the smallest is one pose.
+const SIZES: usize = 3;
 
 /// What is searched, and how the places are judged.
 #[derive(Debug)]
@@ -28,57 +34,172 @@ pub struct Search<'a> {
     pub gain: f64,
 }
 
+/// The scan at one heading.
+#[derive(Debug)]
+struct Turned {
+    pose: Pose2,
+    /// Least cost of the heading, wherever the robot is.
+    cost: f64,
+    /// Cells of the window that points lie in.
+    points: Vec<(i32, i32)>,
+}
+
+/// Poses of one heading: a square of offsets, in cells, from `first` on.
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    heading: usize,
+    first: (i32, i32),
+    /// None of them is likelier, nats.
+    bound: f64,
+}
+
+/// The likeliest pose so far, and how likely it is.
+type Best = (f64, Pose2);
+
 impl Search<'_> {
     /// The likeliest pose of the window around the prior's.
     #[must_use]
     pub fn run(&self) -> Pose2 {
         let cell = self.level.resolution();
         let [reach, turn] = self.deviations.map(|deviation| DEVIATIONS * deviation);
-        let cells = (reach.min(FURTHEST[0]) / cell).max(NEAREST);
+        let cells = (reach.min(FURTHEST[0]) / cell).clamp(NEAREST, MARGIN) as i32;
         let angle = cell / self.lever.max(cell);
-        let turns = (turn.min(FURTHEST[1]) / angle).max(NEAREST);
-        let mean = self.prior.pose_in_map;
-        let mut best = (f64::NEG_INFINITY, mean);
-        for heading in from_the_middle(turns as i32) {
-            let theta = wrap_angle(mean.theta + f64::from(heading) * angle);
-            let turned = Pose2::new(mean.x, mean.y, theta);
-            let points = self.cells(turned);
-            for row in from_the_middle(cells as i32) {
-                for column in from_the_middle(cells as i32) {
-                    let moved = [f64::from(column) * cell, f64::from(row) * cell];
-                    let pose = Pose2::new(mean.x + moved[0], mean.y + moved[1], theta);
-                    let score = self.score(&points, (column, row)) - self.prior.cost(pose);
-                    if score > best.0 {
-                        best = (score, pose);
-                    }
-                }
-            }
+        let turns = (turn.min(FURTHEST[1]) / angle).max(NEAREST) as i32;
+        let headings: Vec<Turned> =
+            (-turns..=turns).map(|heading| self.turned(f64::from(heading) * angle)).collect();
+        let mut maxima = vec![Maxima::of(self.level, self.prior.pose_in_map, cells)];
+        for size in 1..SIZES {
+            maxima.push(maxima[size - 1].pooled((BRANCHES as usize).pow(size as u32 - 1)));
         }
+        let largest = BRANCHES.pow(SIZES as u32 - 1);
+        let firsts = || (-cells..=cells).step_by(largest as usize);
+        let squares = headings.iter().enumerate().flat_map(|(heading, turned)| {
+            let maxima = &maxima[SIZES - 1];
+            firsts().flat_map(move |y| firsts().map(move |x| (x, y))).map(move |first| Block {
+                heading,
+                first,
+                bound: self.gain * maxima.sum(&turned.points, first) - turned.cost,
+            })
+        });
+        let mut best = (f64::NEG_INFINITY, self.prior.pose_in_map);
+        self.explore(squares.collect(), (&headings, &maxima, cells), &mut best);
         best.1
     }
 
-    /// The cells of the window that some of the points lie in.
-    fn cells(&self, pose: Pose2) -> Vec<(i32, i32)> {
+    /// Looks into the blocks that may hold a likelier pose than the best.
+    fn explore(
+        &self,
+        mut blocks: Vec<Block>,
+        window: (&[Turned], &[Maxima], i32),
+        best: &mut Best,
+    ) {
+        let (headings, maxima, cells) = window;
+        blocks.sort_by(|a, b| b.bound.total_cmp(&a.bound));
+        let (_, smaller) = maxima.split_last().expect("there is a size");
+        for block in blocks {
+            if block.bound <= best.0 {
+                break;
+            }
+            let turned = &headings[block.heading];
+            let Some(sums) = smaller.last() else {
+                let pose = self.moved(turned.pose, block.first);
+                let likelihood = block.bound + turned.cost - self.prior.cost(pose);
+                if likelihood > best.0 {
+                    *best = (likelihood, pose);
+                }
+                continue;
+            };
+            let size = BRANCHES.pow(smaller.len() as u32 - 1);
+            let along = |first: i32| (0..BRANCHES).map(move |i| first + i * size);
+            let parts = along(block.first.1)
+                .flat_map(|y| along(block.first.0).map(move |x| (x, y)))
+                .filter(|(x, y)| *x <= cells && *y <= cells)
+                .map(|first| Block {
+                    first,
+                    bound: self.gain * sums.sum(&turned.points, first) - turned.cost,
+                    ..block
+                });
+            self.explore(parts.collect(), (headings, smaller, cells), best);
+        }
+    }
+
+    fn moved(&self, pose: Pose2, (x, y): (i32, i32)) -> Pose2 {
+        let cell = self.level.resolution();
+        Pose2::new(pose.x + f64::from(x) * cell, pose.y + f64::from(y) * cell, pose.theta)
+    }
+
+    fn turned(&self, turn: f64) -> Turned {
+        let mean = self.prior.pose_in_map;
+        let pose = Pose2::new(mean.x, mean.y, wrap_angle(mean.theta + turn));
         let points = self.level.points();
         let [x, y] = self.level.in_window(pose);
         let (sin, cos) = libm::sincos(pose.theta);
         let in_cell = |&[px, py]: &[f32; 2]| {
             let (px, py) = (f64::from(px), f64::from(py));
-            let floor = super::super::grid::floor;
             (floor(x + cos * px - sin * py), floor(y + sin * px + cos * py))
         };
         let step = points.len().div_ceil(MOST_POINTS).max(1);
-        points.iter().step_by(step).map(in_cell).collect()
-    }
-
-    fn score(&self, points: &[(i32, i32)], (dx, dy): (i32, i32)) -> f64 {
-        let hit = |&(column, row): &(i32, i32)| self.level.probability(column + dx, row + dy);
-        let sum: f32 = points.iter().map(hit).sum();
-        self.gain * f64::from(sum)
+        let points = points.iter().step_by(step).map(in_cell).collect();
+        let deviation = self.deviations[1];
+        Turned { pose, cost: 0.5 * (turn / deviation) * (turn / deviation), points }
     }
 }
 
-/// 0, 1, -1, 2, -2 and so on: of equals, the first and nearest is taken.
-fn from_the_middle(most: i32) -> impl Iterator<Item = i32> {
-    (0..=2 * most).map(|i| if i % 2 == 1 { i.div_euclid(2) + 1 } else { -i.div_euclid(2) })
+/// For each cell around the scan, the highest probability in a square that begins there.
+#[derive(Debug)]
+struct Maxima {
+    /// The lower-left cell, in the window.
+    first: (i32, i32),
+    width: usize,
+    of: Vec<f32>,
+}
+
+/// Of cells outside.
+const UNKNOWN: f32 = 0.5;
+
+impl Maxima {
+    /// In squares of one cell, for poses up to `cells` away from `pose`.
+    fn of(level: &Level<'_>, pose: Pose2, cells: i32) -> Self {
+        let squared = level.points().iter().map(|[x, y]| x * x + y * y).fold(0.0, f32::max);
+        let reach = squared.sqrt() as i32 + cells + 2;
+        let [left, bottom] = level.in_window(pose).map(|at| floor(at) - reach);
+        let width = 2 * reach + 1;
+        let mut of = Vec::with_capacity((width * width) as usize);
+        for row in bottom..bottom + width {
+            of.extend((left..left + width).map(|column| level.probability(column, row)));
+        }
+        Self { first: (left, bottom), width: width as usize, of }
+    }
+
+    /// In squares of [`BRANCHES`] times the side, which is `size` so far.
+    fn pooled(&self, size: usize) -> Self {
+        let rows = most_of_four(&self.of, size);
+        Self { of: most_of_four(&rows, size * self.width), ..*self }
+    }
+
+    /// Over points moved by some cells.
+    fn sum(&self, points: &[(i32, i32)], (dx, dy): (i32, i32)) -> f64 {
+        let (dx, dy) = (dx - self.first.0, dy - self.first.1);
+        let at = |&(column, row): &(i32, i32)| {
+            let index = (row + dy) as usize * self.width + (column + dx) as usize;
+            self.of.get(index).copied().unwrap_or(UNKNOWN)
+        };
+        f64::from(points.iter().map(at).sum::<f32>())
+    }
+}
+
+/// The highest of each value and the [`BRANCHES`] - 1 that follow at `step`.
+fn most_of_four(of: &[f32], step: usize) -> Vec<f32> {
+    let mut most = of.to_vec();
+    for branch in 1..BRANCHES as usize {
+        let shifted = &of[(branch * step).min(of.len())..];
+        let (inside, edge) = most.split_at_mut(shifted.len());
+        for (value, other) in inside.iter_mut().zip(shifted) {
+            *value = if other > value { *other } else { *value };
+        }
+        for value in edge {
+            *value = value.max(UNKNOWN);
+        }
+    }
+    most
 }

@@ -17,7 +17,7 @@ const LONGEST_STEP: f64 = 2.0;
 /// Steps below this, cells, end the search.
 const SHORTEST_STEP: f64 = 0.01;
 /// Room for the pose to move within a window, cells.
-const MARGIN: f64 = 24.0;
+pub(super) const MARGIN: f64 = 24.0;
 
 /// What is known of a pose before the scan is looked at.
 #[derive(Debug, Clone, Copy)]
@@ -114,6 +114,19 @@ impl<'a> Level<'a> {
         self.probabilities.of(self.window.get(column as usize, row as usize))
     }
 
+    /// The share of the points that lie in cells of which nothing is known.
+    #[must_use]
+    pub fn unknown_share(&self, pose: Pose2) -> f64 {
+        let [x, y] = self.in_window(pose).map(|cells| cells as f32);
+        let (sin, cos) = libm::sincos(pose.theta);
+        let (sin, cos) = (sin as f32, cos as f32);
+        let unknown = |&&[px, py]: &&[f32; 2]| {
+            let (column, row) = (x + cos * px - sin * py, y + sin * px + cos * py);
+            self.probability(column as i32, row as i32) == 0.5
+        };
+        self.points.iter().filter(unknown).count() as f64 / self.points.len().max(1) as f64
+    }
+
     /// The interpolated occupancy at a point of the window, in cells, and its derivatives.
     #[inline]
     fn interpolate(&self, x: f32, y: f32) -> [f32; 3] {
@@ -157,6 +170,12 @@ impl<'a> Level<'a> {
             h[5] += turn * turn;
         }
         self.in_metres(cost, b, h)
+    }
+
+    /// 1 - (1 - M)² on average over the points.
+    #[must_use]
+    pub fn explains(&self, pose: Pose2) -> f64 {
+        1.0 - self.fit(pose).cost / self.points.len().max(1) as f64
     }
 
     fn in_metres(&self, cost: f32, b: [f32; 3], h: [f32; 6]) -> Fit {

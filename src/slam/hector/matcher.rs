@@ -20,8 +20,9 @@ const POOR: f64 = 0.5;
 const WORSE: f64 = 0.93;
 /// With a prediction this unsure, a search follows in any case.
 const VERY_POOR: f64 = 3.0;
-/// A match counts if Σ (1 - (1 - M)²) is at least this a point.
-const LEAST_MEAN: f64 = 0.3;
+/// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
+/// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
+const LEAST_EXPLAINED: f64 = 0.7;
 /// What a residual weighs beside the prediction: 1 / its variance.
 const GAIN: f64 = 1.0;
 /// What a residual tells, once the pose is found: this makes the squared error, normalized,
@@ -43,6 +44,8 @@ pub struct Placed {
     pub score: f64,
     /// How many those are.
     pub points: f64,
+    /// The share of them that lies where the coarsest map knows nothing.
+    pub news: f64,
     /// What the scan does not tell.
     pub weakness: Weakness,
 }
@@ -58,12 +61,16 @@ impl Placed {
             matched: true,
             score: 0.0,
             points: 0.0,
+            news: 1.0,
             weakness,
         }
     }
 }
 
 /// The likeliest place of a scan, if scans usually score `expected` a point, up to 1.
+///
+/// A scan that contradicts the map is looked for further around, and if that does not help either,
+/// it is nowhere in particular there.
 #[must_use]
 pub fn place(
     pyramid: &Pyramid,
@@ -72,48 +79,76 @@ pub fn place(
     expected: f64,
 ) -> Placed {
     let lever = lever(&scan.hits);
-    let weakness = Weakness::of(&scan.hits, lever);
-    let &Prediction { pose_in_map, covariance } = prediction;
-    let Some(prior) = prediction.prior() else {
-        return Placed {
+    let matcher = Matcher {
+        weakness: Weakness::of(&scan.hits, lever),
+        levels: pyramid.levels(scan, prediction.pose_in_map).collect(),
+        lever,
+    };
+    let placed = matcher.place(prediction, expected);
+    if placed.matched {
+        return placed;
+    }
+    let lost = prediction.lost();
+    let elsewhere = matcher.place(&lost, expected);
+    if elsewhere.matched {
+        return elsewhere;
+    }
+    Placed { pose_in_map: lost.pose_in_map, covariance: lost.covariance, ..placed }
+}
+
+/// A scan and the maps it is matched with.
+#[derive(Debug)]
+struct Matcher<'a> {
+    /// Coarsest first.
+    levels: Vec<Level<'a>>,
+    weakness: Weakness,
+    lever: f64,
+}
+
+impl Matcher<'_> {
+    fn place(&self, prediction: &Prediction, expected: f64) -> Placed {
+        let &Self { ref levels, weakness, lever } = self;
+        let &Prediction { pose_in_map, covariance } = prediction;
+        let points = levels.last().map_or(0, |level| level.points().len()) as f64;
+        let unknown = Placed {
             pose_in_map,
             covariance,
             matched: false,
             score: 0.0,
-            points: 0.0,
+            points,
+            news: 0.0,
             weakness,
         };
-    };
-    let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
-    let levels: Vec<Level<'_>> = pyramid.levels(scan, pose_in_map).collect();
-    let points = levels.last().map_or(0, |level| level.points().len()) as f64;
-    let deviations = prediction.deviations();
-    let unsure = deviations[0].max(deviations[1] * lever) / levels[0].resolution();
-    let search = || {
-        let gain = SEARCH_GAIN;
-        let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
-        descend(&levels, &problem, search.run())
-    };
-    let found = if unsure > VERY_POOR {
-        search()
-    } else {
-        let near = descend(&levels, &problem, pose_in_map);
-        let fits = points - near.1.cost >= WORSE * expected * points;
-        let cost = |found: &(Pose2, Fit)| problem.cost(&found.1, found.0);
-        let other = (unsure > POOR && !fits).then(search);
-        other.filter(|other| cost(other) < cost(&near)).unwrap_or(near)
-    };
-    let (pose, fit) = found;
-    let score = points - fit.cost;
-    let (hessian, _) = weakness.without(&fit, pose.theta);
-    let information = CERTAINTY * hessian + prior.information;
-    Placed {
-        pose_in_map: pose,
-        covariance: information.try_inverse().unwrap_or(covariance),
-        matched: score >= LEAST_MEAN * points,
-        score,
-        points,
-        weakness,
+        let Some(prior) = prediction.prior() else { return unknown };
+        let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
+        let deviations = prediction.deviations();
+        let unsure = deviations[0].max(deviations[1] * lever) / levels[0].resolution();
+        let search = || {
+            let gain = SEARCH_GAIN;
+            let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
+            descend(levels, &problem, search.run())
+        };
+        let (pose, fit) = if unsure > VERY_POOR {
+            search()
+        } else {
+            let near = descend(levels, &problem, pose_in_map);
+            let fits = points - near.1.cost >= WORSE * expected * points;
+            let cost = |found: &(Pose2, Fit)| problem.cost(&found.1, found.0);
+            let other = (unsure > POOR && !fits).then(search);
+            other.filter(|other| cost(other) < cost(&near)).unwrap_or(near)
+        };
+        let score = points - fit.cost;
+        let (hessian, _) = weakness.without(&fit, pose.theta);
+        let information = CERTAINTY * hessian + prior.information;
+        Placed {
+            pose_in_map: pose,
+            covariance: information.try_inverse().unwrap_or(covariance),
+            matched: score >= LEAST_EXPLAINED * points
+                || levels[0].explains(pose) >= LEAST_EXPLAINED,
+            score,
+            news: levels[0].unknown_share(pose),
+            ..unknown
+        }
     }
 }
 

@@ -15,6 +15,8 @@ pub mod pyramid;
 pub mod state;
 pub mod weakness;
 
+use std::sync::Arc;
+
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
@@ -39,6 +41,10 @@ const RENEWAL: f64 = 0.1;
 /// How surely an initial pose in a known map is given or found: standard deviations, m and rad.
 const INITIAL: [f64; 2] = [0.1, 0.05];
 
+/// Without odometry, a scan enters the map in any case if more than this share of what it sees is
+/// new: the next ones have nothing else to go by.
+const NEWS: f64 = 0.2;
+
 /// The engine.
 #[derive(Debug, Clone)]
 pub struct Hector {
@@ -59,7 +65,7 @@ pub struct Hector {
 #[derive(Debug, Clone, Default)]
 struct Beginning {
     /// The map that is known before the first scan.
-    known: Option<Box<KnownMap>>,
+    known: Option<Arc<KnownMap>>,
     /// Why the last scan could not be the first one.
     obstacle: Option<NotLocalized>,
 }
@@ -106,7 +112,7 @@ impl Hector {
 
     /// Begins with a known map, before the first scan. Without an initial pose, the first scan's
     /// is searched for.
-    pub fn begin_on(&mut self, known: Box<KnownMap>) {
+    pub fn begin_on(&mut self, known: Arc<KnownMap>) {
         let Self { pyramid, output, .. } = self;
         pyramid.enter(known.cells(), |tile| output.stale.push(tile));
         self.beginning = Beginning { known: Some(known), obstacle: None };
@@ -233,7 +239,7 @@ impl Hector {
 
     /// Searches the known map, if there is one, for where the first scan was taken.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &mut self.beginning.known else { return Ok(()) };
+        let Some(known) = &self.beginning.known else { return Ok(()) };
         if self.parameters.initial_pose.is_none() {
             match known.find(&scan.outline, None) {
                 Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
@@ -265,12 +271,14 @@ impl Hector {
     fn advance(&mut self, sweep: &Sweep<'_>, placed: &Placed) -> bool {
         let (pose_in_map, stamp) = (placed.pose_in_map, sweep.scan.stamp);
         let last = self.state.map(|state| state.registered_at);
-        let registered = last.is_none_or(|last| {
-            let moved = last.between(pose_in_map);
-            moved.position().norm() > self.parameters.update_distance
-                || moved.theta.abs() > self.parameters.update_angle
-        });
-        let velocity = self.state.and_then(|state| {
+        let registered = placed.matched
+            && last.is_none_or(|last| {
+                let moved = last.between(pose_in_map);
+                (sweep.odom_from_base.is_none() && placed.news > NEWS)
+                    || moved.position().norm() > self.parameters.update_distance
+                    || moved.theta.abs() > self.parameters.update_angle
+            });
+        let velocity = self.state.filter(|_| placed.matched).and_then(|state| {
             let seconds = stamp.seconds_since(state.stamp);
             prediction::velocity(state.pose_in_map.between(pose_in_map), seconds)
         });

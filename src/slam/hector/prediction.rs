@@ -12,7 +12,9 @@ const DISTRUST: [f64; 2] = [3.0, 5.0];
 /// Odometry is never surer than this: m and rad.
 const ODOMETRY_FLOOR: [f64; 2] = [0.005, 0.003];
 /// Without odometry, robots are believed to change their speed like this: m/s² and rad/s².
-const ACCELERATION: [f64; 2] = [2.0, 4.0];
+const ACCELERATION: [f64; 2] = [8.0, 16.0];
+/// Without odometry, a motion that no scan confirms dies away with this time constant, s.
+const PERSISTENCE: f64 = 1.0;
 /// Without odometry, the next scan is never surer than this: m and rad.
 const VELOCITY_FLOOR: [f64; 2] = [0.01, 0.01];
 /// Without odometry, a robot does not get further between two scans: m and rad.
@@ -47,7 +49,8 @@ impl Prediction {
     #[must_use]
     pub fn by_velocity(from: (Pose2, Matrix3<f64>), velocity: Option<Pose2>, seconds: f64) -> Self {
         let known = velocity.filter(|_| seconds > 0.0 && seconds <= STEADY[1]);
-        let increment = known.map_or(Pose2::IDENTITY, |velocity| scaled(velocity, seconds));
+        let coasting = PERSISTENCE * (1.0 - libm::exp(-seconds / PERSISTENCE));
+        let increment = known.map_or(Pose2::IDENTITY, |velocity| scaled(velocity, coasting));
         let [distance, angle] = [0, 1].map(|axis| {
             let changed = 0.5 * ACCELERATION[axis] * seconds * seconds;
             let reach = if known.is_some() { changed } else { FURTHEST[axis] };
@@ -61,6 +64,17 @@ impl Prediction {
     pub fn within(pose_in_map: Pose2, [distance, angle]: [f64; 2]) -> Self {
         let variances = Vector3::new(distance * distance, distance * distance, angle * angle);
         Self { pose_in_map, covariance: Matrix3::from_diagonal(&variances) }
+    }
+
+    /// Somewhere around there: what is left when the scan contradicts what it was.
+    #[must_use]
+    pub fn lost(&self) -> Self {
+        let [distance, angle] = FURTHEST;
+        Self::after(
+            (self.pose_in_map, self.covariance),
+            Pose2::IDENTITY,
+            [distance, distance, angle],
+        )
     }
 
     fn after((pose, covariance): (Pose2, Matrix3<f64>), step: Pose2, deviations: [f64; 3]) -> Self {
