@@ -4,6 +4,7 @@ use gmapd::sim::lidar::Lidar;
 use gmapd::slam::engine::{Engine, EngineParameters, Sweep};
 use gmapd::slam::gmapping::{MatcherKind, MatcherParameters, Parameters};
 use gmapd::slam::hector;
+use gmapd::slam::known_map::Mode;
 use gmapd::slam::known_poses::{self, FURTHEST_CELL, MapExtent};
 use gmapd::slam::outline::BeamLimits;
 use gmapd::slam::pose::{Point2, Pose2, Stamp};
@@ -97,6 +98,9 @@ fn going_on_from_a_state_is_as_if_nothing_had_happened() {
                 assert_eq!(bytes(&other), state, "{name} at {index}");
                 resumed.push(other);
             }
+            // For a while the map is frozen.
+            let mode = if (50..70).contains(&index) { Mode::Localization } else { Mode::Mapping };
+            std::iter::once(&mut whole).chain(&mut resumed).for_each(|e| e.set_mode(mode));
             let shot = std::slice::from_ref(shot);
             feed(&mut whole, &lidar, shot);
             resumed.iter_mut().for_each(|engine| feed(engine, &lidar, shot));
