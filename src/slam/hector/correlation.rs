@@ -18,6 +18,8 @@ const FURTHEST: [f64; 2] = [2.0, 1.2];
 const BRANCHES: i32 = 4;
 /// ... and blocks have so many sizes; the smallest is one pose.
 const SIZES: usize = 3;
+/// A window that reaches less far, cells, is searched pose by pose.
+const FEW: i32 = 6;
 
 /// What is searched, and how the places are judged.
 #[derive(Debug)]
@@ -67,6 +69,9 @@ impl Search<'_> {
         let turns = (turn.min(FURTHEST[1]) / angle).max(NEAREST) as i32;
         let headings: Vec<Turned> =
             (-turns..=turns).map(|heading| self.turned(f64::from(heading) * angle)).collect();
+        if cells < FEW {
+            return self.try_all(&headings, cells);
+        }
         let mut maxima = vec![Maxima::of(self.level, self.prior.pose_in_map, cells)];
         for size in 1..SIZES {
             maxima.push(maxima[size - 1].pooled((BRANCHES as usize).pow(size as u32 - 1)));
@@ -83,6 +88,23 @@ impl Search<'_> {
         });
         let mut best = (f64::NEG_INFINITY, self.prior.pose_in_map);
         self.explore(squares.collect(), (&headings, &maxima, cells), &mut best);
+        best.1
+    }
+
+    /// The same for a small window, where maxima would cost more than they save.
+    fn try_all(&self, headings: &[Turned], cells: i32) -> Pose2 {
+        let mut best = (f64::NEG_INFINITY, self.prior.pose_in_map);
+        for turned in headings {
+            for (y, x) in (-cells..=cells).flat_map(|y| (-cells..=cells).map(move |x| (y, x))) {
+                let hit = |&(column, row)| self.level.probability(column + x, row + y);
+                let sum: f32 = turned.points.iter().map(hit).sum();
+                let pose = self.moved(turned.pose, (x, y));
+                let likelihood = self.gain * f64::from(sum) - self.prior.cost(pose);
+                if likelihood > best.0 {
+                    best = (likelihood, pose);
+                }
+            }
+        }
         best.1
     }
 
