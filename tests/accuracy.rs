@@ -193,7 +193,10 @@ fn processed(log: &CarmenLog, config: &Config) -> u64 {
             Verdict::Processed => processed += 1,
             Verdict::NotMovedEnough | Verdict::NoUsableBeams => passed_over += 1,
             Verdict::OdometryOnly => without += 1,
-            verdict @ (Verdict::Throttled | Verdict::BadOdometry | Verdict::BadGeometry) => {
+            verdict @ (Verdict::Throttled
+            | Verdict::BadOdometry
+            | Verdict::BadGeometry
+            | Verdict::NotLocalized) => {
                 panic!("{verdict:?}")
             }
         }

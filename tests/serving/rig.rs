@@ -110,6 +110,7 @@ fn status() -> Status {
         version: "1.2.3",
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
+        mode: Mode::Mapping,
         detail: "odometry is missing".to_owned(),
         pose_in_map: Pose2::IDENTITY,
         scans: BTreeMap::new(),
