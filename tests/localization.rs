@@ -182,7 +182,9 @@ fn a_map_is_frozen_and_thawed_on_the_way() {
         let mut engine = starting::engine(&config(&[name]), 1).expect("it needs no map");
         let shots = shots(&room(CORNER), &lidar, &route(CORNER));
         let third = shots.len() / 3;
-        shots[..third].iter().for_each(|shot| drop(add(&mut engine, &lidar, shot)));
+        for shot in &shots[..third] {
+            add(&mut engine, &lidar, shot);
+        }
         engine.set_mode(Mode::Localization);
         let frozen = engine.occupancy_grid();
         for shot in &shots[third..2 * third] {
@@ -190,7 +192,9 @@ fn a_map_is_frozen_and_thawed_on_the_way() {
         }
         assert_eq!(engine.occupancy_grid(), frozen, "{name}");
         engine.set_mode(Mode::Mapping);
-        shots[2 * third..].iter().for_each(|shot| drop(add(&mut engine, &lidar, shot)));
+        for shot in &shots[2 * third..] {
+            add(&mut engine, &lidar, shot);
+        }
         assert_ne!(engine.occupancy_grid(), frozen, "{name}");
         assert_eq!(engine.path().len(), shots.len(), "{name}");
         let truth = route(CORNER)[shots.len() - 1];
@@ -198,8 +202,11 @@ fn a_map_is_frozen_and_thawed_on_the_way() {
     }
 }
 
+/// A wall from one point to another, m.
+type Wall = ((f64, f64), (f64, f64));
+
 /// A map with walls, all else within `size` free.
-fn drawn(walls: &[((f64, f64), (f64, f64))], size: (f64, f64)) -> (OccupancyGrid, World) {
+fn drawn(walls: &[Wall], size: (f64, f64)) -> (OccupancyGrid, World) {
     const CELL: f64 = 0.05;
     let cells = |metres: f64| (metres / CELL).round() as usize;
     let (width, height) = (cells(size.0), cells(size.1));
@@ -328,6 +335,43 @@ fn complaint(arguments: &[&str]) -> String {
     let output = gmapd(arguments);
     assert_eq!(output.status.code(), Some(1), "{arguments:?}");
     String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn a_replay_localizes_in_the_map_of_another_and_leaves_it_as_it_is() {
+    let folder = Folder::new("replay");
+    let [log, first, second] =
+        ["drive.log", "first", "second"].map(|name| folder.0.join(name).display().to_string());
+    let done = |arguments: &[&str]| {
+        let output = gmapd(arguments);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    };
+    done(&["simulate", "--seed", "5", "--out", &log]);
+    let replay = ["replay", &log, "--set", "particles=4", "--out"];
+    done(&[&replay[..], &[&first]].concat());
+    let map = format!("{first}/map.yaml");
+    let frozen = [&second, "--map", &map, "--initial-pose", "search", "--mode", "localization"];
+    done(&[&replay[..], &frozen].concat());
+    let image = |folder: &str| std::fs::read(format!("{folder}/map.pgm")).expect("it is written");
+    assert!(image(&first) == image(&second), "the map stays as it is");
+    let summary = |folder: &str| -> serde_json::Value {
+        let text = std::fs::read(format!("{folder}/summary.json")).expect("it is written");
+        serde_json::from_slice(&text).expect("it is JSON")
+    };
+    let processed = |folder| summary(folder)["readings"]["processed"].as_u64();
+    assert!(processed(&second) > Some(400), "{:?}", processed(&second));
+    let poses = |folder: &str| -> Vec<Vec<f64>> {
+        let text = std::fs::read_to_string(format!("{folder}/trajectory.tum")).expect("written");
+        let line =
+            |line: &str| line.split(' ').map(|word| word.parse().expect("a number")).collect();
+        text.lines().filter(|text| !text.starts_with('#')).map(line).collect()
+    };
+    let (mapped, localized) = (poses(&first), poses(&second));
+    assert_eq!(mapped.len(), localized.len());
+    for (a, b) in mapped.iter().zip(&localized) {
+        let metres = (a[1] - b[1]).hypot(a[2] - b[2]);
+        assert!(metres < 0.15, "at {}: {metres} m from where it was mapped", a[0]);
+    }
 }
 
 #[test]

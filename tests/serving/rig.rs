@@ -116,6 +116,7 @@ fn status() -> Status {
         mode: Mode::Mapping,
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
+        mode: Mode::Mapping,
         detail: "odometry is missing".to_owned(),
         pose_in_map: Pose2::IDENTITY,
         laser: None,
