@@ -121,6 +121,13 @@ struct Rig {
     _directory: tempfile::TempDir,
 }
 
+/// Whether anybody listens to the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Heard {
+    Yes,
+    No,
+}
+
 struct Program(Child);
 
 impl Drop for Program {
@@ -171,15 +178,15 @@ impl Rig {
             program,
             _directory: directory,
         };
-        rig.heard(true).await;
+        rig.heard(Heard::Yes).await;
         rig
     }
 
     /// Until the daemon is known to listen, or known not to.
-    async fn heard(&self, wanted: bool) {
+    async fn heard(&self, wanted: Heard) {
         for publisher in [&self.scan, &self.odom] {
             let listener = publisher.matching_listener().await.unwrap();
-            while publisher.matching_status().await.unwrap().matching() != wanted {
+            while publisher.matching_status().await.unwrap().matching() != (wanted == Heard::Yes) {
                 let change = tokio::time::timeout(PATIENCE, listener.recv_async()).await;
                 change.expect("nothing changes").unwrap();
             }
@@ -272,10 +279,10 @@ async fn a_connection_that_is_cut_comes_back() {
     for _ in 0..3 {
         assert!(rig.map(30, 0).await > 0);
         rig.wire.is(Condition::Cut);
-        rig.heard(false).await;
+        rig.heard(Heard::No).await;
         rig.send(10, 0).await;
         rig.wire.is(Condition::Whole);
-        rig.heard(true).await;
+        rig.heard(Heard::Yes).await;
     }
     rig.ends(3).await;
 }
@@ -285,10 +292,10 @@ async fn a_network_that_is_silent_is_noticed_and_comes_back() {
     let mut rig = Rig::start().await;
     assert!(rig.map(30, 0).await > 0);
     rig.wire.is(Condition::Silent);
-    rig.heard(false).await;
+    rig.heard(Heard::No).await;
     rig.send(10, 0).await;
     rig.wire.is(Condition::Whole);
-    rig.heard(true).await;
+    rig.heard(Heard::Yes).await;
     rig.ends(1).await;
 }
 
@@ -297,9 +304,9 @@ async fn a_router_that_restarts_is_found_again() {
     let mut rig = Rig::start().await;
     assert!(rig.map(30, 0).await > 0);
     rig.router.close().await.unwrap();
-    rig.heard(false).await;
+    rig.heard(Heard::No).await;
     rig.router = router(rig.port).await.0;
-    rig.heard(true).await;
+    rig.heard(Heard::Yes).await;
     rig.ends(1).await;
 }
 

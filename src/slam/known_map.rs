@@ -1,7 +1,5 @@
 //! A map that mapping starts from, and whether maps grow at all.
 
-use std::sync::OnceLock;
-
 use serde::{Deserialize, Serialize};
 
 use super::grid::Cell;
@@ -30,8 +28,7 @@ pub struct KnownMap {
     threshold: OccupiedThreshold,
     /// The cell of the map that has the grid's first cell, most of it.
     first: Cell,
-    /// Made when a pose is searched for.
-    search: OnceLock<SearchMap>,
+    search: SearchMap,
 }
 
 impl KnownMap {
@@ -44,7 +41,8 @@ impl KnownMap {
     pub fn new(grid: OccupancyGrid, threshold: OccupiedThreshold) -> Self {
         let nearest = |metres: f64| libm::round(metres / grid.resolution) as i32;
         let first = Cell::new(nearest(grid.origin.x), nearest(grid.origin.y));
-        Self { grid, threshold, first, search: OnceLock::new() }
+        let search = SearchMap::new(&grid, occupied_above(threshold));
+        Self { grid, threshold, first, search }
     }
 
     /// Metres a cell.
@@ -68,7 +66,7 @@ impl KnownMap {
             (self.first.ix..).zip(row).map(move |(ix, value)| (Cell::new(ix, iy), *value))
         });
         let known = cells.filter(|(_, value)| *value >= 0);
-        known.map(|(cell, value)| (cell, f64::from(value) > self.occupied_above()))
+        known.map(|(cell, value)| (cell, f64::from(value) > occupied_above(self.threshold)))
     }
 
     /// The middles of cells with obstacles, in cells from the lower-left corner of [`Self::first`].
@@ -88,7 +86,7 @@ impl KnownMap {
         self.first
     }
 
-    /// Where a scan was taken; `pool` may help. The first search makes the map ready.
+    /// Where a scan was taken; `pool` may help.
     ///
     /// # Errors
     /// When it fits nowhere, or at two places.
@@ -99,14 +97,11 @@ impl KnownMap {
     ) -> Result<Place, NotLocalized> {
         let hits = scan.ends.iter().filter(|end| end.kind == BeamEndKind::Hit);
         let hits: Vec<[f32; 2]> = hits.map(|end| end.point).collect();
-        let occupied_above = self.occupied_above();
-        let Self { grid, search, .. } = self;
-        let search = search.get_or_init(|| SearchMap::new(grid, occupied_above));
-        search.find(&hits, pool)
+        self.search.find(&hits, pool)
     }
+}
 
-    /// Of 100.
-    fn occupied_above(&self) -> f64 {
-        100.0 * self.threshold.share
-    }
+/// Of 100.
+fn occupied_above(threshold: OccupiedThreshold) -> f64 {
+    100.0 * threshold.share
 }

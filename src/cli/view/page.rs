@@ -78,8 +78,9 @@ async fn tell(socket: &mut WebSocket, mut heard: Heard) -> Result<(), Gone> {
             else => return Ok(()),
         };
         for message in messages {
-            let taken = timeout(PATIENCE, socket.send(message)).await;
-            taken.map_err(|_| Gone)?.map_err(|_| Gone)?;
+            let Ok(Ok(())) = timeout(PATIENCE, socket.send(message)).await else {
+                return Err(Gone);
+            };
         }
     }
 }
