@@ -56,7 +56,7 @@ fn inputs(name: &str) -> Vec<Vec<u8>> {
 }
 
 /// An input that is not borne is kept, to become one of the corpus.
-fn bear(name: &str, target: fn(&[u8]), input: &[u8]) {
+fn bear(name: &str, target: targets::Target, input: &[u8]) {
     let region = Region::new(MEMORY);
     let ended = catch_unwind(AssertUnwindSafe(|| target(input)));
     let allocated = region.change().bytes_allocated;

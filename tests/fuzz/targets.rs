@@ -17,8 +17,11 @@ use gmapd::slam::engine::Engine;
 use gmapd::slam::state::EngineState;
 use gmapd::{convert, map, ros};
 
+/// Bears any bytes.
+pub type Target = fn(&[u8]);
+
 /// By the name of the folder of their inputs.
-pub const ALL: [(&str, fn(&[u8])); 6] = [
+pub const ALL: [(&str, Target); 6] = [
     ("decoders", decoders),
     ("selectors", selectors),
     ("tiles", tiles),
