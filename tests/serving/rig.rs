@@ -116,7 +116,6 @@ fn status() -> Status {
         mode: Mode::Mapping,
         uptime_s: 4.5,
         state: State::WaitingForOdometry,
-        mode: Mode::Mapping,
         detail: "odometry is missing".to_owned(),
         pose_in_map: Pose2::IDENTITY,
         laser: None,
