@@ -307,7 +307,7 @@ async fn a_wildcard_asks_everything_and_commands_nothing() {
     assert_eq!(keys, names.map(|name| format!("{ROBOT}/{name}")));
     let refusals: Vec<&String> =
         answers.iter().filter_map(|answer| answer.as_ref().err()).collect();
-    assert_eq!(refusals.len(), 6, "{refusals:?}");
+    assert_eq!(refusals.len(), 7, "{refusals:?}");
     assert!(refusals.iter().all(|error| error.contains("wildcard")), "{refusals:?}");
     assert!(rig.commands.try_recv().is_err());
     assert!(!rig.directory.path().join("maps").exists());

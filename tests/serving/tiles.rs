@@ -17,7 +17,7 @@ use zenoh::query::ConsolidationMode;
 use super::*;
 
 /// Beyond what is promised, for a machine that does other things as well.
-const SLACK: Duration = Duration::from_secs(2);
+const SLACK: Duration = Duration::from_secs(10);
 
 async fn follow(session: &zenoh::Session) -> MapMirror {
     let robot = Prefix::parse(ROBOT).expect("it is a key");
