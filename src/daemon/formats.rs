@@ -8,12 +8,13 @@ use bytes::Bytes;
 use serde::Serialize;
 use thiserror::Error;
 
+use super::last_seen::Sightings;
 use super::selector::{MapFormat, MessageFormat, PathFormat, RegionQuestion};
 use super::snapshot::MapVersion;
 use crate::convert;
 use crate::evaluation::{self, StampedPose};
 use crate::map;
-use crate::map::region::{Layer, Region, RegionError, Window};
+use crate::map::region::{Known, LastSeen, Layer, Region, RegionError, Window};
 use crate::ros;
 use crate::slam::grid::occupancy::{OccupancyGrid, OccupancyMap, OccupiedThreshold};
 use crate::slam::path::Path;
@@ -66,6 +67,7 @@ pub enum FormatError {
 #[derive(Debug)]
 pub struct MapProducts {
     version: Option<Arc<MapVersion>>,
+    last_seen: LastSeen,
     empty: EmptyMap,
     grid: OnceLock<OccupancyGrid>,
     label: OnceLock<Label>,
@@ -84,6 +86,7 @@ impl MapProducts {
     pub const fn new(version: Option<Arc<MapVersion>>, empty: EmptyMap) -> Self {
         Self {
             version,
+            last_seen: LastSeen::new(),
             empty,
             grid: OnceLock::new(),
             label: OnceLock::new(),
@@ -195,8 +198,12 @@ impl MapProducts {
     /// # Errors
     /// When its cells would be too fine or too many.
     pub fn layers(&self, asked: &RegionQuestion, layers: &[Layer]) -> Result<Bytes, FormatError> {
-        let (map, threshold) = self.counted();
-        Ok(self.cells_of(asked)?.json(layers, map, threshold).into())
+        let known = self.version.as_ref().map(|version| Known {
+            map: &version.occupancy,
+            threshold: version.occupied_threshold,
+            last_seen: &self.last_seen,
+        });
+        Ok(self.cells_of(asked)?.json(layers, known).into())
     }
 
     fn counted(&self) -> (Option<&OccupancyMap>, OccupiedThreshold) {
@@ -285,7 +292,7 @@ impl MapProducts {
 #[derive(Debug)]
 pub struct ProductCache {
     empty: EmptyMap,
-    newest: Mutex<Arc<MapProducts>>,
+    newest: Mutex<(Arc<MapProducts>, Sightings)>,
     asked: AtomicBool,
 }
 
@@ -294,7 +301,11 @@ impl ProductCache {
     #[must_use]
     pub fn new(empty: EmptyMap) -> Self {
         let first = MapProducts::new(None, empty.clone());
-        Self { empty, newest: Mutex::new(Arc::new(first)), asked: AtomicBool::new(false) }
+        Self {
+            empty,
+            newest: Mutex::new((Arc::new(first), Sightings::default())),
+            asked: AtomicBool::new(false),
+        }
     }
 
     /// Notes that somebody has asked for the map.
@@ -304,8 +315,8 @@ impl ProductCache {
 
     /// Makes a new version ready for the next who asks, if somebody asked for the one before.
     pub fn make_ready(&self, version: &Arc<MapVersion>) {
+        let products = self.of(Some(version));
         if self.asked.swap(false, Ordering::Relaxed) {
-            let products = self.of(Some(version));
             let _ready = (products.cdr(), products.label());
         }
     }
@@ -314,10 +325,13 @@ impl ProductCache {
     #[must_use]
     pub fn of(&self, version: Option<&Arc<MapVersion>>) -> Arc<MapProducts> {
         let mut newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
-        if newest.version() != version.map_or(0, |version| version.version) {
-            *newest = Arc::new(MapProducts::new(version.cloned(), self.empty.clone()));
+        let (products, sightings) = &mut *newest;
+        if products.version() != version.map_or(0, |version| version.version) {
+            let last_seen = sightings.update(version);
+            let made = MapProducts::new(version.cloned(), self.empty.clone());
+            *products = Arc::new(MapProducts { last_seen, ..made });
         }
-        newest.clone()
+        products.clone()
     }
 }
 

@@ -14,6 +14,7 @@ pub mod frames;
 pub mod input;
 mod judgement;
 pub mod keys;
+mod last_seen;
 pub mod ledger;
 pub mod limits;
 pub mod links;

@@ -40,6 +40,10 @@ use crate::ros::graph::{
 };
 use crate::slam::pose::Pose2;
 
+/// A map that comes while another is on its way is passed over. When nothing newer has come for
+/// this long, the newest is sent once more, so that the last one of a drive arrives.
+const AGAIN: Duration = Duration::from_secs(5);
+
 /// How often it is looked whether somebody takes the map, beside being told: who leaves and comes
 /// back at once may not be told of.
 const LOOK: Duration = Duration::from_secs(1);
@@ -342,8 +346,11 @@ impl RetainedOutput {
         let mut version = 0;
         let mut resting = false;
         let rest = tokio::time::sleep(Duration::ZERO);
-        tokio::pin!(rest);
+        let again = tokio::time::sleep(Duration::ZERO);
+        tokio::pin!(rest, again);
+        let mut waits_for_again = false;
         loop {
+            let mut repeats = false;
             tokio::select! {
                 changed = snapshots.changed() => if changed.is_err() { return },
                 matched = matching.recv_async() => match matched {
@@ -352,17 +359,21 @@ impl RetainedOutput {
                     Err(_) => return,
                 },
                 () = &mut rest, if resting => resting = false,
+                () = &mut again, if waits_for_again => (waits_for_again, repeats) = (false, true),
             }
             let snapshot = snapshots.borrow_and_update().clone();
             let Some(newest) = &snapshot.map else { continue };
-            if resting || newest.version == version {
+            if resting || (newest.version == version && !repeats) {
                 continue;
             }
             resting = true;
             if self.is_wanted().await {
                 version = newest.version;
-                content = self.put(self.products.of(Some(newest)), content).await;
+                let last = content.take().filter(|_| !repeats);
+                content = self.put(self.products.of(Some(newest)), last).await;
                 rest.set(tokio::time::sleep(self.interval));
+                again.set(tokio::time::sleep(self.interval + AGAIN));
+                waits_for_again = !repeats;
             } else {
                 rest.set(tokio::time::sleep(LOOK));
             }

@@ -540,7 +540,7 @@ fn window(value: &str) -> Result<Window, SelectorError> {
 fn layers(value: &str) -> Result<Vec<Layer>, SelectorError> {
     let mut found = Vec::new();
     for name in value.split(',') {
-        let known = [Layer::Occupancy, Layer::Hits, Layer::Visits];
+        let known = Layer::ALL;
         let layer = known.into_iter().find(|layer| layer.name() == name);
         let layer = layer.filter(|layer| !found.contains(layer));
         found.push(layer.ok_or_else(|| SelectorError::NoLayer(excerpt(name)))?);
@@ -728,8 +728,14 @@ mod tests {
             ("bbox=0,0,1e7,1", "bbox=\"0,0,1e7,1\" is not allowed"),
             ("res=0", "res=\"0\" is not allowed; it must be metres a cell"),
             ("res=-1", "res=\"-1\" is not allowed"),
-            ("layers=last_seen", "there is no layer \"last_seen\"; allowed are occupancy, hits"),
-            ("layers=hits,hits", "there is no layer \"hits\"; allowed are occupancy, hits, visits"),
+            (
+                "layers=age",
+                "there is no layer \"age\"; allowed are occupancy, hits, visits, last_seen",
+            ),
+            (
+                "layers=hits,hits",
+                "there is no layer \"hits\"; allowed are occupancy, hits, visits, last_seen",
+            ),
             ("layers=", "there is no layer \"\""),
             ("layers=hits;format=png", "format goes with layers=occupancy alone"),
         ] {

@@ -6,7 +6,7 @@ use thiserror::Error;
 use super::tiles::Extent;
 use crate::slam::grid::Cell;
 use crate::slam::grid::occupancy::{Count, OccupancyGrid, OccupancyMap, OccupiedThreshold};
-use crate::slam::grid::tile_map::{TILE_SIZE, TileKey};
+use crate::slam::grid::tile_map::{TILE_SIZE, TileKey, TileMap};
 use crate::slam::pose::Point2;
 
 /// Cells that a region may have.
@@ -61,6 +61,20 @@ pub enum RegionError {
     },
 }
 
+/// When cells were seen last: whole seconds of stamps, and one more; 0 is never.
+pub type LastSeen = TileMap<u32>;
+
+/// What layers are drawn from.
+#[derive(Debug, Clone, Copy)]
+pub struct Known<'a> {
+    /// Hits and visits.
+    pub map: &'a OccupancyMap,
+    /// When a cell is occupied.
+    pub threshold: OccupiedThreshold,
+    /// When cells were seen.
+    pub last_seen: &'a LastSeen,
+}
+
 /// What is known of each cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layer {
@@ -70,9 +84,14 @@ pub enum Layer {
     Hits,
     /// Scans that saw the cell.
     Visits,
+    /// The stamp of the last one, s; -1 where there was none.
+    LastSeen,
 }
 
 impl Layer {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Occupancy, Self::Hits, Self::Visits, Self::LastSeen];
+
     /// As queries and answers call it.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -80,6 +99,7 @@ impl Layer {
             Self::Occupancy => "occupancy",
             Self::Hits => "hits",
             Self::Visits => "visits",
+            Self::LastSeen => "last_seen",
         }
     }
 }
@@ -123,7 +143,8 @@ impl Region {
         map: Option<&OccupancyMap>,
         threshold: OccupiedThreshold,
     ) -> OccupancyGrid {
-        let cells = self.maxima(map, -1, |count| count.occupancy(threshold));
+        let seen = |count: Count| (count.visits > 0).then(|| count.occupancy(threshold));
+        let cells = self.maxima(map.map(OccupancyMap::counts), -1, seen);
         let corner = |i: i32| f64::from(i) * self.resolution;
         OccupancyGrid {
             resolution: self.resolution,
@@ -134,31 +155,33 @@ impl Region {
         }
     }
 
-    fn layer(
-        &self,
-        layer: Layer,
-        map: Option<&OccupancyMap>,
-        threshold: OccupiedThreshold,
-    ) -> Vec<i64> {
+    fn layer(&self, layer: Layer, known: Option<Known<'_>>) -> Vec<i64> {
+        let map = known.map(|known| known.map);
+        let counted = |value: fn(Count) -> u32| {
+            let value = |count: Count| (count.visits > 0).then(|| value(count).into());
+            self.maxima(map.map(OccupancyMap::counts), 0, value)
+        };
         match layer {
-            Layer::Occupancy => self.maxima(map, -1, |count| count.occupancy(threshold).into()),
-            Layer::Hits => self.maxima(map, 0, |count| count.hits.into()),
-            Layer::Visits => self.maxima(map, 0, |count| count.visits.into()),
+            Layer::Occupancy => {
+                let threshold = known.map_or(OccupiedThreshold::of_share(0.0), |of| of.threshold);
+                self.occupancy(map, threshold).cells.into_iter().map(i64::from).collect()
+            }
+            Layer::Hits => counted(|count| count.hits),
+            Layer::Visits => counted(|count| count.visits),
+            Layer::LastSeen => {
+                let seconds = |seen: u32| (seen > 0).then(|| i64::from(seen) - 1);
+                self.maxima(known.map(|known| known.last_seen), -1, seconds)
+            }
         }
     }
 
     /// Layers as JSON: size and place as in the JSON of a map, and in `layers` the runs of each,
     /// the largest value of the merged cells in each.
     #[must_use]
-    pub fn json(
-        &self,
-        layers: &[Layer],
-        map: Option<&OccupancyMap>,
-        threshold: OccupiedThreshold,
-    ) -> String {
+    pub fn json(&self, layers: &[Layer], known: Option<Known<'_>>) -> String {
         let corner = |i: i32| f64::from(i) * self.resolution;
         let runs = layers.iter().map(|&layer| {
-            let cells = self.layer(layer, map, threshold);
+            let cells = self.layer(layer, known);
             let runs = cells.chunk_by(|a, b| a == b).map(|run| (run[0], run.len()));
             (layer.name().to_owned(), serde_json::json!(runs.collect::<Vec<_>>()))
         });
@@ -173,11 +196,11 @@ impl Region {
     }
 
     /// The largest value of the known cells that each cell of the region covers.
-    fn maxima<T: Copy + Ord>(
+    fn maxima<C: Copy + Default, T: Copy + Ord>(
         &self,
-        map: Option<&OccupancyMap>,
+        map: Option<&TileMap<C>>,
         unknown: T,
-        value: impl Fn(Count) -> T,
+        value: impl Fn(C) -> Option<T>,
     ) -> Vec<T> {
         let (width, height) = (self.extent.width as usize, self.extent.height as usize);
         let mut cells = vec![unknown; width * height];
@@ -191,9 +214,9 @@ impl Region {
             (fine(self.extent.ix, self.extent.width), fine(self.extent.iy, self.extent.height));
         let first = TileKey::containing(Cell::new(left, bottom));
         let last = TileKey::containing(Cell::new(right, top));
-        for (key, counts) in map.counts().tiles_between(first, last) {
+        for (key, tile) in map.tiles_between(first, last) {
             let corner = key.first_cell();
-            for (i, &count) in counts.iter().enumerate().filter(|(_, count)| count.visits > 0) {
+            for (i, value) in tile.iter().enumerate().filter_map(|(i, &c)| Some((i, value(c)?))) {
                 let ix = corner.ix + (i % TILE_SIZE) as i32;
                 let iy = corner.iy + (i / TILE_SIZE) as i32;
                 let column = i64::from(ix.div_euclid(self.factor)) - i64::from(self.extent.ix);
@@ -203,7 +226,7 @@ impl Region {
                 };
                 if column < width && row < height {
                     let cell = &mut cells[row * width + column];
-                    *cell = (*cell).max(value(count));
+                    *cell = (*cell).max(value);
                 }
             }
         }
@@ -292,15 +315,22 @@ mod tests {
             map.add(&outline, Pose2::IDENTITY);
         }
         let region = Region::new(window([2.0, 0.0], [2.2, 0.2]), 0.2, FINE).unwrap();
-        let text = region.json(&[Layer::Hits, Layer::Visits], Some(&map), THRESHOLD);
+        let mut last_seen = LastSeen::new();
+        *last_seen.get_mut(Cell::new(20, 0)) = 8;
+        *last_seen.get_mut(Cell::new(21, 1)) = 5;
+        let known = |map| Some(Known { map, threshold: THRESHOLD, last_seen: &last_seen });
+        let text = region.json(&[Layer::Hits, Layer::Visits, Layer::LastSeen], known(&map));
         assert_eq!(
             text,
-            r#"{"resolution":0.2,"width":1,"height":1,"origin":[2.0,0.0],"layers":{"hits":[[3,1]],"visits":[[3,1]]}}"#
+            r#"{"resolution":0.2,"width":1,"height":1,"origin":[2.0,0.0],"layers":{"hits":[[3,1]],"last_seen":[[7,1]],"visits":[[3,1]]}}"#
         );
-        let text = region.json(&[Layer::Hits], Some(&clone), THRESHOLD);
+        let text = region.json(&[Layer::Hits], known(&clone));
         assert!(text.ends_with(r#""layers":{"hits":[[1,1]]}}"#), "{text}");
-        let text = region.json(&[Layer::Occupancy, Layer::Hits], None, THRESHOLD);
-        assert!(text.ends_with(r#""layers":{"hits":[[0,1]],"occupancy":[[-1,1]]}}"#), "{text}");
+        let text = region.json(&[Layer::Occupancy, Layer::LastSeen], None);
+        assert!(
+            text.ends_with(r#""layers":{"last_seen":[[-1,1]],"occupancy":[[-1,1]]}}"#),
+            "{text}"
+        );
     }
 
     #[test]

@@ -328,6 +328,7 @@ async fn updates_make_the_last_map_the_next_one() {
 async fn a_region_is_answered_in_coarser_cells() {
     let snapshot = last();
     let whole = grid(&snapshot);
+    let seconds = version(&snapshot).stamp.0 / 1_000_000_000;
     let rig = Rig::start(snapshot).await;
     let region: ros::OccupancyGrid = rig.ask_message("map?bbox=-1,-1,1.9,2;res=0.2").await;
     assert!((region.info.resolution - 0.2).abs() < 1e-6);
@@ -337,14 +338,15 @@ async fn a_region_is_answered_in_coarser_cells() {
     assert_eq!(same.data, ros::Int8Array::from(whole.cells.as_slice()));
     let picture = rig.ask("map?res=0.1;format=png").await.expect("it can be drawn");
     assert!(picture.bytes.starts_with(b"\x89PNG"));
-    let layers = rig.ask_json("map?bbox=0,0,1,1;layers=hits,visits").await;
+    let layers = rig.ask_json("map?bbox=0,0,1,1;layers=hits,visits,last_seen").await;
     assert_eq!((&layers["width"], &layers["height"]), (&20.into(), &20.into()));
     assert!(layers["layers"]["visits"][0][0].as_u64() > Some(0), "{layers}");
+    assert_eq!(layers["layers"]["last_seen"], serde_json::json!([[seconds, 400]]));
     for (selector, begins) in [
         ("map?bbox=1,1,0,0", "bbox=\"1,1,0,0\" is inverted or empty"),
         ("map?bbox=-1e6,-1e6,1e6,1e6", "the region has 40000000 by 40000000 cells of 0.05 m"),
         ("map?res=0.01", "res=0.01 is finer than the map, which has 0.05 m a cell"),
-        ("map?layers=last_seen", "there is no layer \"last_seen\""),
+        ("map?layers=age", "there is no layer \"age\""),
     ] {
         let error = rig.ask(selector).await.unwrap_err();
         assert!(error.starts_with(begins), "{error}");
