@@ -88,14 +88,14 @@ mod tests {
             map.clone()
         };
         let mut sightings = Sightings::default();
-        let seen = |seen: &LastSeen| [1, 8, 20].map(|ix| seen.get(Cell::new(ix, 0)));
+        let seen = |seen: &LastSeen| [10, 4, 20].map(|ix| seen.get(Cell::new(ix, 0)));
         let first = sightings.update(Some(&version(1, &look(1.05))));
-        assert_eq!(seen(&first), [11, 11, 0]);
+        assert_eq!(seen(&first), [11, 0, 0]);
         let second = sightings.update(Some(&version(2, &look(0.45))));
-        assert_eq!(seen(&second), [21, 11, 0]);
+        assert_eq!(seen(&second), [11, 21, 0]);
         let third = sightings.update(Some(&version(3, &look(2.05))));
-        assert_eq!(seen(&third), [31, 31, 31]);
-        assert_eq!(seen(&first), [11, 11, 0], "what was handed out stays");
+        assert_eq!(seen(&third), [11, 21, 31]);
+        assert_eq!(seen(&first), [11, 0, 0], "what was handed out stays");
         assert_eq!(seen(&sightings.update(None)), [0; 3]);
     }
 }

@@ -338,8 +338,8 @@ pub enum SelectorError {
     NoArea(String),
     /// A layer that is not known.
     #[error(
-        "there is no layer {0:?}; allowed are occupancy, hits, visits, with commas between, each \
-         once (when a cell was seen last is not kept)"
+        "there is no layer {0:?}; allowed are occupancy, hits, visits, last_seen, with commas \
+         between, each once"
     )]
     NoLayer(String),
     /// Layers that a format cannot show.
