@@ -184,7 +184,9 @@ impl Mirror {
         }
         Ok(if self.is_newest() {
             Progress::Newest
-        } else if message.part + 1 < message.parts && head.version == newest.version {
+        } else if u32::from(message.part) + 1 < u32::from(message.parts)
+            && head.version == newest.version
+        {
             Progress::Underway
         } else {
             Progress::Missing
