@@ -125,11 +125,12 @@ impl Mesh {
         let robot = self.open("robot").await;
         let daemon = Daemon::start(&robot, settings(&[])).await.unwrap();
         let [base, reader] = [self.open("base").await, self.open("reader").await];
-        assert_eq!(ask(&reader, "robot01/slam/status").await.len(), 1);
-        assert_eq!(ask(&reader, "*/slam/status").await.len(), 1);
+        for selector in ["robot01/slam/status", "*/slam/status", "robot01/map?format=json"] {
+            assert_eq!(ask_until_answered(&reader, selector).await.len(), 1);
+        }
 
         assert!(ask(&reader, "robot01/slam/cmd/pause").await.is_empty());
-        let wildcard = ask(&reader, "robot01/slam/*/pause").await;
+        let wildcard = ask_until_answered(&reader, "robot01/slam/*/pause").await;
         assert!(wildcard[0].contains("wildcard"), "{wildcard:?}");
         assert_eq!(daemon.status().state, State::WaitingForScans);
         self.log.says(&["(reader)", "unauthorized to Query (ingress) on robot01/slam/cmd"]).await;
@@ -146,11 +147,11 @@ impl Mesh {
         let lie = |query: Query| query.reply(query.key_expr(), "a lie").wait().unwrap();
         let impostor = reader.declare_queryable("robot01/map").callback(lie).await.unwrap();
         assert_eq!(ask(&reader, "robot01/slam/status").await.len(), 1);
-        let maps = ask(&base, "robot01/map?format=json").await;
+        let maps = ask_until_answered(&base, "robot01/map?format=json").await;
         assert!(maps.len() == 1 && maps[0].contains("resolution"), "{maps:?}");
         impostor.undeclare().await.unwrap();
 
-        let paused = ask(&base, "robot01/slam/cmd/pause").await;
+        let paused = ask_until_answered(&base, "robot01/slam/cmd/pause").await;
         assert!(paused[0].contains("mapping is paused"), "{paused:?}");
         let mut verdicts = daemon.verdicts();
         let laser = self.open("robot").await;
@@ -191,6 +192,19 @@ async fn ask(session: &Session, selector: &str) -> Vec<String> {
         texts.push(payload.try_to_string().unwrap().into_owned());
     }
     texts
+}
+
+/// As [`ask`], of one whose declarations may still be on their way.
+async fn ask_until_answered(session: &Session, selector: &str) -> Vec<String> {
+    let answered = async {
+        loop {
+            let texts = ask(session, selector).await;
+            if !texts.is_empty() {
+                break texts;
+            }
+        }
+    };
+    tokio::time::timeout(PATIENCE, answered).await.unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread")]
