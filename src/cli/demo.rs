@@ -27,6 +27,7 @@ use zenoh::Session;
 
 use super::feed::Feed;
 use super::mesh;
+use super::signals::Signals;
 use super::view;
 
 /// The world, the robot's errors and the filter's random numbers.
@@ -115,6 +116,7 @@ impl Drive {
         let robot = mesh::name(prefix);
         println!("a simulated robot drives {:.0} s at {SPEED} times its speed", self.duration_s);
         println!("meanwhile: gmapd get -e {endpoint} {robot} map");
+        let mut signals = Signals::listen()?;
         let mut page = JoinSet::new();
         if arguments.view {
             let opened = view::Page::open(([127, 0, 0, 1], 0).into(), robot_session.clone());
@@ -127,10 +129,10 @@ impl Drive {
                 driven?;
                 if arguments.view {
                     println!("the drive is over; the page is there until Ctrl-C");
-                    tokio::signal::ctrl_c().await.context("no signals come")?;
+                    signals.next().await;
                 }
             }
-            signal = tokio::signal::ctrl_c() => signal.context("no signals come")?,
+            () = signals.next() => {}
         }
         let last = daemon.stop().await;
         robot_session.close().await.ok();

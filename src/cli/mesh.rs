@@ -56,15 +56,30 @@ pub(super) async fn ask(session: &Session, selector: &str) -> anyhow::Result<Opt
 pub(super) async fn ask_robot(
     session: &Session,
     robot: &Prefix,
-    (name, parameters): (&str, &str),
+    question: (&str, &str),
 ) -> anyhow::Result<Answer> {
+    match ask_who_may_be_gone(session, robot, question).await? {
+        Some(answer) => Ok(answer),
+        None => Err(nobody_answers(robot, question.0, &alive(session).await?)),
+    }
+}
+
+/// As [`ask_robot`]; `None` if nobody answers.
+pub(super) async fn ask_who_may_be_gone(
+    session: &Session,
+    robot: &Prefix,
+    (name, parameters): (&str, &str),
+) -> anyhow::Result<Option<Answer>> {
     let key = robot.key(name)?;
     let selector =
         if parameters.is_empty() { key.to_string() } else { format!("{key}?{parameters}") };
-    match ask(session, &selector).await? {
-        Some(answer) => Ok(answer),
-        None => bail!("nobody answers on {key}; {}", remedy(&alive(session).await?)),
-    }
+    ask(session, &selector).await
+}
+
+/// What is wrong when a robot does not answer to a key, with those who would.
+pub(super) fn nobody_answers(robot: &Prefix, name: &str, alive: &[Prefix]) -> anyhow::Error {
+    let slash = if robot.to_string().is_empty() { "" } else { "/" };
+    anyhow!("nobody answers on {robot}{slash}{name}; {}", remedy(alive))
 }
 
 /// The answers of all robots to a key, with the robots that gave them; errors are passed over.

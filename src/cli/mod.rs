@@ -16,6 +16,7 @@ mod replay;
 mod run;
 mod save;
 mod session;
+mod signals;
 mod simulate;
 mod start;
 mod state;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{bail, ensure};
 use clap::Args;
 use gmapd::clock::Stopwatch;
 use gmapd::config::{Config, RawConfig};
@@ -21,6 +21,7 @@ use super::log::{Log, TopicArguments};
 use super::mesh;
 use super::progress::Progress;
 use super::session::SessionArguments;
+use super::signals::Signals;
 
 /// A daemon that has subscribed answers soon after.
 const DAEMON_PATIENCE: Duration = Duration::from_secs(3);
@@ -99,13 +100,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     mesh::block_on(async {
         let session = arguments.session.open().await?;
+        let mut signals = Signals::listen()?;
         let mut feed = Feed::open(&session, &arguments.prefix).await?;
         let watch = Stopwatch::start();
         let how = tokio::select! {
             played = play(&mut feed, &log, survey, arguments) => played.map(|()| "played"),
-            signal = tokio::signal::ctrl_c() => {
-                signal.map(|()| "interrupted after").context("no signals come")
-            }
+            () = signals.next() => Ok("interrupted after"),
         }?;
         println!("{how} {}", told(&feed, watch.elapsed().wall));
         session.close().await.ok();

@@ -10,11 +10,11 @@ use gmapd::daemon::input::Input;
 use gmapd::daemon::keys::{InputKeys, Prefix};
 use gmapd::daemon::recorder::Recorder;
 use serde::Deserialize;
-use tokio::signal::unix::{SignalKind, signal};
 use zenoh::Session;
 
 use super::mesh;
 use super::session::SessionArguments;
+use super::signals::Signals;
 
 /// Whom to record, and where to.
 #[derive(Debug, Args)]
@@ -50,8 +50,8 @@ struct InputStatus {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mesh::block_on(async {
-        let mut terminate = signal(SignalKind::terminate()).context("no signals come")?;
         let session = arguments.session.open().await?;
+        let mut signals = Signals::listen()?;
         let robot = mesh::choose(&session, arguments.robot.as_deref()).await?;
         let keys = input_keys(&session, &robot).await?;
         let recorder = Recorder::start(&session, &robot, &keys, &arguments.output).await?;
@@ -60,10 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             mesh::name(&robot),
             recorder.unfinished().display()
         );
-        tokio::select! {
-            signal = tokio::signal::ctrl_c() => signal.context("no signals come")?,
-            _ = terminate.recv() => {}
-        }
+        signals.next().await;
         let recorded = recorder.finish().await?;
         println!("recorded {} messages to {}", recorded.messages, recorded.path.display());
         if recorded.lost > 0 {

@@ -12,11 +12,11 @@ use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::{self, Settings};
 use gmapd::starting;
 use tokio::runtime::Handle;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::spawn_blocking;
 use tracing_subscriber::EnvFilter;
 
 use super::session::SessionArguments;
+use super::signals::Signals;
 use super::start::StartArguments;
 
 /// What is logged if nothing is said: Zenoh tells more than an operator wants to know.
@@ -168,27 +168,4 @@ async fn tell_where(session: &zenoh::Session, robot: &str) {
     }
     let robot = if robot.is_empty() { String::new() } else { format!("{robot} ") };
     tracing::info!("how it goes: gmapd get {robot}status");
-}
-
-/// What ends the daemon.
-struct Signals {
-    interrupt: Signal,
-    terminate: Signal,
-}
-
-impl Signals {
-    fn listen() -> anyhow::Result<Self> {
-        let listen = |kind| signal(kind).context("cannot listen to signals");
-        Ok(Self {
-            interrupt: listen(SignalKind::interrupt())?,
-            terminate: listen(SignalKind::terminate())?,
-        })
-    }
-
-    async fn next(&mut self) {
-        tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-        }
-    }
 }

@@ -51,6 +51,16 @@ impl Fleet {
         self.robots.clone()
     }
 
+    /// The robots that are alive.
+    ///
+    /// They are not asked for again: beside a subscriber to the same, Zenoh's answers to that are
+    /// at times not whole.
+    pub(super) fn alive(&self) -> Vec<Prefix> {
+        let robots = self.robots.borrow();
+        let alive = robots.iter().filter(|(_, is_alive)| **is_alive);
+        alive.filter_map(|(name, _)| Prefix::parse(name).ok()).collect()
+    }
+
     /// What is seen of a robot; it is watched as long as somebody holds this.
     pub(super) async fn watch(&self, robot: &Prefix) -> anyhow::Result<Arc<Watched>> {
         let mut watched = self.watched.lock().await;

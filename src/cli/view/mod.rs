@@ -25,6 +25,7 @@ use self::fleet::Fleet;
 use self::guard::Guard;
 use super::mesh;
 use super::session::SessionArguments;
+use super::signals::Signals;
 
 /// Where the mesh is, and where the page is to be.
 #[derive(Debug, Args)]
@@ -39,7 +40,7 @@ use super::session::SessionArguments;
         gmapd view\n  \
         gmapd view -e tcp/192.168.1.5:7447\n  \
         gmapd view --listen 0.0.0.0:8080      for a phone: open the address that is printed\n\n\
-    Exit codes: 0 ended by Ctrl-C, 1 failed, 2 wrong usage.")]
+    Exit codes: 0 ended by a signal, 1 failed, 2 wrong usage.")]
 pub(crate) struct Arguments {
     /// Address and port of the page; port 0 is any that is free
     #[arg(short, long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
@@ -57,11 +58,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mesh::block_on(async {
         let mesh = SessionArguments::connecting(zenoh.clone(), connect.clone());
         let session = mesh.open().await?;
+        let mut signals = Signals::listen()?;
         let page = Page::open(*listen, session.clone()).await?;
         println!("{}", page.address);
         tokio::select! {
             ended = page.serve() => ended?,
-            signal = tokio::signal::ctrl_c() => signal.context("cannot wait for Ctrl-C")?,
+            () = signals.next() => {}
         }
         session.close().await.ok();
         Ok(())
@@ -221,5 +223,8 @@ async fn command(
 
 async fn asked(site: &Site, whom: &Whom, question: (&str, &str)) -> anyhow::Result<Vec<u8>> {
     let robot = Prefix::parse(whom.robot.as_deref().context("no robot is named")?)?;
-    Ok(mesh::ask_robot(site.fleet.session(), &robot, question).await?.bytes)
+    match mesh::ask_who_may_be_gone(site.fleet.session(), &robot, question).await? {
+        Some(answer) => Ok(answer.bytes),
+        None => Err(mesh::nobody_answers(&robot, question.0, &site.fleet.alive())),
+    }
 }
