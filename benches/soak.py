@@ -154,7 +154,7 @@ def soak(options, directory):
     gmapd = str(options.gmapd.resolve())
     log = pathlib.Path(directory) / "sim.log"
     laps = max(2, round(options.hours * 8) + 1)
-    simulate = [gmapd, "simulate", "--laps", str(laps), "--beams", "180", "--out", str(log)]
+    simulate = [gmapd, "simulate", "--laps", str(laps), "--beams", "180", "--outlier-rate", "0", "--out", str(log)]
     subprocess.run(simulate, check=True, stdout=subprocess.DEVNULL)
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]

@@ -218,6 +218,40 @@ fn a_room_leaves_nothing_open_and_is_mapped_without_odometry() {
     }
 }
 
+/// Mean squared error of the motion in a second, m² and rad², of a robot that turns while its laser
+/// does; without odometry, and with or without the times of the beams.
+fn squared_errors(timed: bool) -> [f64; 2] {
+    let mut simulation = Simulation::new(&Scenario::new(Place::Building, 1)).expect("beams");
+    simulation.scan_period_ns = 100_000_000;
+    simulation.lidar.sweep_duration_s = 0.1;
+    let mount = simulation.lidar.mount;
+    let mut hector = Hector::new(Parameters::default());
+    let mut poses = Vec::new();
+    for mut reading in simulation.readings().take(600) {
+        if !timed {
+            reading.scan.geometry = reading.scan.geometry.with_time_increment(0.0);
+        }
+        let sweep = Sweep { scan: &reading.scan, mount: &mount, odom_from_base: None };
+        report(hector.add_scan(&sweep, &mut |_| ()));
+        poses.push((reading.world_from_base, hector.pose_in_map()));
+    }
+    let errors: Vec<Pose2> = poses
+        .iter()
+        .zip(&poses[10..])
+        .map(|(then, now)| then.0.between(now.0).between(then.1.between(now.1)))
+        .collect();
+    let mean =
+        |square: fn(&Pose2) -> f64| errors.iter().map(square).sum::<f64>() / errors.len() as f64;
+    [mean(|error| error.position().norm().powi(2)), mean(|error| error.theta.powi(2))]
+}
+
+#[test]
+fn without_odometry_a_sweep_is_deskewed_by_the_motion_so_far() {
+    let (raw, deskewed) = (squared_errors(false), squared_errors(true));
+    println!("{raw:?} as taken, {deskewed:?} deskewed");
+    assert!(deskewed[0] < 0.7 * raw[0] && deskewed[1] < 0.5 * raw[1], "{raw:?} {deskewed:?}");
+}
+
 #[test]
 fn scans_enter_the_map_only_after_enough_motion_and_move_the_pose_before() {
     let lidar = full_circle(360);

@@ -29,6 +29,9 @@ pub(crate) struct SimulateArgs {
     /// Beams of the laser, all around
     #[arg(long, value_name = "N", default_value_t = 360)]
     beams: usize,
+    /// Share of the beams that return from where nothing is
+    #[arg(long, value_name = "SHARE", default_value_t = 0.007, value_parser = share)]
+    outlier_rate: f64,
     /// Odometry readings a scan
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1000))]
     odometry_per_scan: u32,
@@ -82,9 +85,15 @@ fn simulation(args: &SimulateArgs) -> anyhow::Result<Simulation> {
     };
     let (laps, people, beams) = (args.laps, args.people, args.beams);
     let scenario = Scenario { place, seed: args.seed, laps, people, beams };
-    let simulation = Simulation::new(&scenario)
+    let mut simulation = Simulation::new(&scenario)
         .with_context(|| format!("a laser with --beams {beams} cannot be simulated"))?;
+    simulation.lidar.outlier_rate = args.outlier_rate;
     Ok(Simulation { odometry_per_scan: args.odometry_per_scan, ..simulation })
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    let share = text.parse().map_err(|_| "not a number".to_owned())?;
+    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("not from 0 to 1".to_owned()) }
 }
 
 /// Writes both files and returns the number of readings in the log.
@@ -125,6 +134,7 @@ mod tests {
             laps: 1,
             people: 1,
             beams: 8,
+            outlier_rate: 0.007,
             odometry_per_scan: 2,
             out: directory.join(name),
             truth: None,

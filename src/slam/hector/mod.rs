@@ -25,6 +25,7 @@ pub use self::parameters::Parameters;
 use self::prediction::Prediction;
 use self::prepared_scan::{Directions, PreparedScan};
 use self::pyramid::Pyramid;
+use super::deskew::Velocity;
 use super::engine::Sweep;
 use super::grid::occupancy::{Count, OccupancyMap, OccupiedThreshold};
 use super::grid::tile_map::{TileCounts, TileKey};
@@ -32,6 +33,7 @@ use super::known_map::{KnownMap, Mode};
 use super::odometry::Motion;
 use super::path::Path;
 use super::pose::{Pose2, Stamp};
+use super::scan::Scan;
 use super::search::NotLocalized;
 use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, SkipReason};
 
@@ -218,8 +220,19 @@ impl Hector {
         if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans.max(1)) {
             return Err(SkipReason::Throttled);
         }
-        let scan = self.directions.prepare(sweep.scan, sweep.mount, &self.parameters);
+        let deskewed = self.deskewed(sweep);
+        let scan = deskewed.as_ref().unwrap_or(sweep.scan);
+        let scan = self.directions.prepare(scan, sweep.mount, &self.parameters);
         if scan.hits.is_empty() { Err(SkipReason::NoUsableBeams) } else { Ok(scan) }
+    }
+
+    /// Without odometry, the scan as seen by a robot that goes on as before during the sweep.
+    fn deskewed(&self, sweep: &Sweep<'_>) -> Option<Scan> {
+        let Sweep { scan, odom_from_base: None, .. } = sweep else { return None };
+        let takes_time = scan.geometry.time_increment() != 0.0;
+        let Pose2 { x, y, theta: turn } = self.state.filter(|_| takes_time)?.velocity?;
+        let geometry = scan.geometry.with_velocity(Velocity { x, y, turn });
+        Some(Scan { geometry, ..(*scan).clone() })
     }
 
     /// Where the scan was taken, as far as the map, odometry and the motion so far tell.
@@ -280,7 +293,8 @@ impl Hector {
             });
         let velocity = self.state.filter(|_| placed.matched).and_then(|state| {
             let seconds = stamp.seconds_since(state.stamp);
-            prediction::velocity(state.pose_in_map.between(pose_in_map), seconds)
+            let motion = state.pose_in_map.between(pose_in_map);
+            prediction::velocity(motion, seconds, state.velocity)
         });
         let score = if placed.points > 0.0 { placed.score / placed.points } else { 1.0 };
         let usual = self.state.map_or(1.0, |state| state.usual_score);

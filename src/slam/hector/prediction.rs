@@ -106,13 +106,18 @@ impl Prediction {
 }
 
 /// The motion a second, if `seconds` is a time in which a robot moves steadily, and it is not too
-/// fast for one.
+/// fast for one; it is the mean of that in this step and of what was known `before`.
+///
+/// Without the mean, sweeps that are deskewed by it would begin to swing: a pose that is ahead by
+/// some error makes the next one fall behind by half of that, twice.
 #[must_use]
-pub fn velocity(step: Pose2, seconds: f64) -> Option<Pose2> {
+pub fn velocity(step: Pose2, seconds: f64, before: Option<Pose2>) -> Option<Pose2> {
     let steady = (STEADY[0]..=STEADY[1]).contains(&seconds);
     let velocity = scaled(step, 1.0 / seconds);
     let slow = velocity.position().norm() <= FASTEST[0] && velocity.theta.abs() <= FASTEST[1];
-    (steady && slow).then_some(velocity)
+    let Pose2 { x, y, theta } = before.unwrap_or(velocity);
+    let mean = Pose2::new(velocity.x + x, velocity.y + y, velocity.theta + theta);
+    (steady && slow).then_some(scaled(mean, 0.5))
 }
 
 fn scaled(motion: Pose2, factor: f64) -> Pose2 {
