@@ -141,6 +141,28 @@ fn intel_is_as_accurate_as_the_original_or_better() {
     assert!(mean(1) <= 1.84, "{} degrees", mean(1));
 }
 
+/// Published for scan matching with odometry on this log: 0.220 m.
+#[test]
+fn hector_maps_intel_with_odometry_and_without() {
+    let Some(relations) = recorded("intel/intel.relations") else { return };
+    let relations = read_relations(&relations).expect("they are relations");
+    // The stamps of the log of every scan are interpolated, so that not all relations find theirs.
+    for (log, odometry, least_used) in [
+        ("intel/intel.log", "odometry_source=auto", 2984),
+        ("intel/intel-all-scans.log", "odometry_source=none", 1000),
+    ] {
+        let Some(log) = recorded(log) else { return };
+        let log = CarmenLog::open(&log).expect("it is a log");
+        let overrides = ["engine=hector", "map_resolution=0.05", "maxUrange=40", odometry];
+        let outcome = replay(&log, &config(&overrides));
+        let report = relation_errors(&outcome.trajectory, &relations);
+        assert!(report.used >= least_used, "{} relations", report.used);
+        let error = report.translation_m.expect("some used").mean;
+        eprintln!("intel, {odometry}: {error:.4} m");
+        assert!(error < 0.1, "{error} m");
+    }
+}
+
 /// The poses and the hits in the base frame of the processed scans of a log.
 fn scans_along_path(log: &CarmenLog, config: &Config) -> (Vec<Pose2>, Vec<Vec<Point2>>) {
     let parameters = config.parameters();
