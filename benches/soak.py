@@ -87,9 +87,10 @@ def session(mode, **endpoints):
 
 
 def memory(pid):
+    """What a process has in memory, MB: all of it, and what is not pages of its program file."""
     lines = pathlib.Path(f"/proc/{pid}/status").read_text().splitlines()
-    kib = next(line.split()[1] for line in lines if line.startswith("VmRSS:"))
-    return round(int(kib) * 1024 / 1e6, 1)
+    kib = dict(line.split()[:2] for line in lines if line.startswith(("VmRSS", "RssAnon")))
+    return [round(int(kib[of]) * 1024 / 1e6, 1) for of in ("VmRSS:", "RssAnon:")]
 
 
 def ask(client, selector):
@@ -136,9 +137,11 @@ class Faults:
 
 def row(process, status, driven):
     scan = status["milliseconds_per_scan"] or {}
+    resident, anonymous = memory(process.pid)
     return {
         "driven_s": driven,
-        "resident_mb": memory(process.pid),
+        "resident_mb": resident,
+        "anonymous_mb": anonymous,
         "open_files": len(list(pathlib.Path(f"/proc/{process.pid}/fd").iterdir())),
         "ms_p50": scan.get("p50"),
         "ms_p99": scan.get("p99"),
@@ -201,7 +204,7 @@ def main():
         when: {name: round(statistics.mean(r[name] for r in part), 3) for name in rows[0]}
         for when, part in parts.items()
     }
-    before, after = (part["resident_mb"] for part in summary.values())
+    before, after = (part["anonymous_mb"] for part in summary.values())
     growth = after / before - 1
     print(json.dumps(summary, indent=1), f"\nmemory grew by {100 * growth:.1f} %")
     if options.out:

@@ -76,7 +76,7 @@ impl Head {
         Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Looks whether who has `own` can go on from this.
+    /// Looks whether who has `own` can go on from this; in another mode it can.
     ///
     /// # Errors
     /// When it is of another robot, another engine or another configuration.
@@ -90,8 +90,11 @@ impl Head {
             return Err(Refusal::OtherEngine { found, own });
         }
         let told = |value: Option<&Value>| value.map_or("not set".to_owned(), Value::to_string);
-        let mut keys = self.settings.keys().chain(own.settings.keys());
-        match keys.find(|key| self.settings.get(*key) != own.settings.get(*key)) {
+        let keys = self.settings.keys().chain(own.settings.keys());
+        match keys
+            .filter(|key| *key != MODE)
+            .find(|key| self.settings.get(*key) != own.settings.get(*key))
+        {
             None => Ok(()),
             Some(key) => Err(Refusal::OtherSetting {
                 found: told(self.settings.get(key)),
@@ -101,6 +104,9 @@ impl Head {
         }
     }
 }
+
+/// The key of the configuration that changes during a run, too.
+pub const MODE: &str = "mode";
 
 /// Why a checkpoint is not taken.
 #[derive(Debug, Error)]
@@ -339,6 +345,9 @@ mod tests {
             found.check_against(&head()).unwrap_err().to_string()
         };
         assert!(head().check_against(&head()).is_ok());
+        let mut localizing = head();
+        localizing.settings.insert(MODE.to_owned(), "localization".into());
+        assert!(localizing.check_against(&head()).is_ok());
         assert_eq!(
             refusal(|head| head.robot = "robot02".to_owned()),
             "it is of the robot `robot02`, and this is `robot01`"

@@ -21,6 +21,7 @@ use crate::evaluation::StampedPose;
 use crate::logs::Reading;
 use crate::slam::engine::{Engine, Sweep};
 use crate::slam::grid::occupancy::OccupancyGrid;
+use crate::slam::known_map::Mode;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::{LaserMount, Scan};
@@ -48,6 +49,9 @@ impl Replay {
     /// # Errors
     /// When the map to start from cannot be used, or the threads cannot be started.
     pub fn new(config: &Config, threads: usize) -> Result<Self, StartError> {
+        if config.raw.mode == Mode::Localization && config.raw.map.is_none() {
+            return Err(StartError::NoMap);
+        }
         Ok(Self {
             engine: starting::engine(config, threads)?,
             source: config.raw.odometry_source,

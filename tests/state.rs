@@ -525,3 +525,48 @@ async fn a_checkpoint_can_be_asked_for_and_holds_what_was_commanded() {
     assert_eq!(robot.feed(&moments[20]).await.unwrap(), "paused");
     daemon.terminate(&robot).await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_map_goes_on_in_the_mode_that_was_configured_or_commanded_last() {
+    let mesh = Mesh::new().await;
+    let moments = drive(40);
+    let robot = mesh.robot("robot01").await;
+    let daemon = Daemon::start(&mesh, &robot, &[]).await;
+    robot.feed_all(&moments[..20]).await;
+    robot.ask("slam/cmd/checkpoint").await.unwrap();
+    daemon.kill(&robot).await;
+
+    let localizing = ["--set", "mode=localization", "--set", "commands_per_second=3"];
+    let empty = tempfile::tempdir().unwrap();
+    let refused = Command::new(env!("CARGO_BIN_EXE_gmapd"))
+        .args(["run", "--zenoh"])
+        .arg(&mesh.configuration)
+        .arg("--state")
+        .arg(empty.path())
+        .args(localizing)
+        .output()
+        .unwrap();
+    assert_eq!(refused.status.code(), Some(1));
+    let error = String::from_utf8(refused.stderr).unwrap();
+    assert!(error.contains("has no state of this robot to go on from"), "{error}");
+    let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+    let status = robot.status().await;
+    assert_eq!(status["mode"], "localization");
+    let area = status["map"]["known_area_m2"].clone();
+    assert!(area.as_f64().unwrap() > 1.0, "{status}");
+    robot.feed_all(&moments[20..30]).await;
+    assert_eq!(robot.status().await["map"]["known_area_m2"], area);
+    robot.ask("slam/cmd/mode?mode=mapping").await.unwrap();
+    robot.until_checkpoint(|status| status["written"] == 1).await;
+    daemon.kill(&robot).await;
+
+    let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+    assert_eq!(robot.status().await["mode"], "mapping");
+    robot.ask("slam/cmd/mode?mode=localization").await.unwrap();
+    robot.until_checkpoint(|status| status["written"] == 1).await;
+    daemon.kill(&robot).await;
+
+    let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+    assert_eq!(robot.status().await["mode"], "localization");
+    daemon.terminate(&robot).await;
+}

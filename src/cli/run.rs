@@ -111,11 +111,12 @@ fn settings(arguments: &Arguments) -> anyhow::Result<Settings> {
     overrides.extend(arguments.engine.as_ref().map(|engine| format!("engine={engine}")));
     overrides.extend(arguments.seed.map(|seed| format!("seed={seed}")));
     overrides.extend(arguments.start.overrides());
-    let mut config = Config::load(arguments.config.as_deref(), &overrides)?;
     if let Some(directory) = &arguments.state {
         let text = directory.to_str().context("the path of --state is not UTF-8")?;
-        config.raw.state_directory = Some(text.to_owned());
+        // A JSON string is a YAML string, whatever is in it.
+        overrides.push(format!("state_directory={}", serde_json::Value::from(text)));
     }
+    let config = Config::load(arguments.config.as_deref(), &overrides)?;
     for warning in &config.warnings {
         tracing::warn!("{warning}");
     }

@@ -57,7 +57,9 @@ fn check_start(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError> {
     let (key, reason) = match (raw.engine, &raw.map) {
         (EngineKind::KnownPoses, Some(_)) => ("map", "known_poses starts from no map"),
         (EngineKind::KnownPoses, None) if localizes => ("mode", "to known_poses, poses are given"),
-        (_, None) if localizes => ("mode", "a map to localize in is needed: --map, or map"),
+        (_, None) if localizes && raw.state_directory.is_none() => {
+            ("mode", "a map to localize in is needed: --map, or map, or --state of a run before")
+        }
         (_, None) if searches => ("initial_pose", "a map to search is needed: --map, or map"),
         _ => return Ok(()),
     };

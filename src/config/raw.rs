@@ -262,7 +262,7 @@ pub(super) const GMAPPING_ONLY: [(&str, &str); 5] = [
 pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
 
 /// Keys that the state does not depend on: how the mesh and files are met, and what is handed out.
-pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 18] = [
+pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 23] = [
     "map_update_interval",
     "transform_publish_period",
     "tf_delay",
@@ -278,6 +278,11 @@ pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 18] = [
     "record",
     "state_directory",
     "checkpoint",
+    "commands",
+    "commands_per_second",
+    "queries_at_once",
+    "max_message_bytes",
+    "max_reply_bytes",
     "engine",
     "occ_thresh",
     "occ_min_visits",

@@ -14,11 +14,14 @@ use super::command::Done;
 use super::keys::Prefix;
 use super::mapper::Mapper;
 use super::mapper::state::MapperState;
-use crate::checkpoint::{self, Head, MapSize, Opened, Refusal, Store, StoreError, checkpoints};
+use crate::checkpoint::{
+    self, Head, MODE, MapSize, Opened, Refusal, Store, StoreError, checkpoints,
+};
 use crate::clock::{self, Stopwatch};
 use crate::config::{self, Config, EngineKind};
 use crate::files::WriteError;
 use crate::slam::engine::Engine;
+use crate::slam::known_map::Mode;
 use crate::slam::pose::Stamp;
 use crate::slam::state::EngineState;
 
@@ -104,6 +107,16 @@ pub enum CheckpointsError {
     /// The directory cannot be used.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// There is no state to localize in, and no map either.
+    #[error(
+        "mode is localization, and {} has no state of this robot to go on from: map first, or name \
+         a map",
+        directory.display()
+    )]
+    NothingToLocalizeIn {
+        /// Where states are kept.
+        directory: PathBuf,
+    },
     /// The thread does not start.
     #[error("cannot start the thread that writes checkpoints")]
     Thread(#[source] std::io::Error),
@@ -200,6 +213,11 @@ pub(super) fn attach(
     let store = Store::new(directory.as_ref(), keep)?;
     let own = own_head(config, prefix);
     let status = resume(mapper, store.directory(), &own);
+    let knows_a_map = status.resumed_from.is_some() || config.raw.map.is_some();
+    if config.raw.mode == Mode::Localization && !knows_a_map {
+        let directory = store.directory().to_owned();
+        return Err(CheckpointsError::NothingToLocalizeIn { directory });
+    }
     let status = Arc::new(Mutex::new(status));
     let (jobs, waiting) = channel();
     let pending = Arc::new(AtomicUsize::new(0));
@@ -272,6 +290,10 @@ fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Ref
     opened.head.check_against(own)?;
     let Checkpoint { engine, mapper: state } = Checkpoint::decode(&opened)?;
     mapper.go_on_from(state, engine).map_err(|e| Refusal::Undecodable(e.to_string()))?;
+    // Otherwise it is as the last command left it.
+    if opened.head.settings.get(MODE) != own.settings.get(MODE) {
+        mapper.take_configured_mode();
+    }
     Ok(opened.head)
 }
 

@@ -93,6 +93,7 @@ impl Mapper {
         self.view = View {
             ledger: state.ledger,
             paused: state.paused,
+            mode: self.engine.mode(),
             resamples: state.resamples,
             estimate: state.estimate,
             version: state.version,
@@ -108,6 +109,13 @@ impl Mapper {
         }
         self.publish();
         Ok(())
+    }
+
+    /// Maps or localizes as the configuration says, and not as the state did.
+    pub fn take_configured_mode(&mut self) {
+        self.set_mode(self.first_mode);
+        self.view.changed = true;
+        self.publish();
     }
 }
 

@@ -14,7 +14,7 @@ const ODOMETRY_FLOOR: [f64; 2] = [0.005, 0.003];
 /// Without odometry, robots are believed to change their speed like this: m/s² and rad/s².
 const ACCELERATION: [f64; 2] = [8.0, 16.0];
 /// Without odometry, a motion that no scan confirms dies away with this time constant, s.
-const PERSISTENCE: f64 = 1.0;
+const PERSISTENCE: f64 = 0.3;
 /// Without odometry, the next scan is never surer than this: m and rad.
 const VELOCITY_FLOOR: [f64; 2] = [0.01, 0.01];
 /// Without odometry, a robot does not get further between two scans: m and rad.
