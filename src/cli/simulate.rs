@@ -92,7 +92,7 @@ fn simulation(args: &SimulateArgs) -> anyhow::Result<Simulation> {
 }
 
 fn share(text: &str) -> Result<f64, String> {
-    let share = text.parse().map_err(|_| "not a number".to_owned())?;
+    let share = text.parse::<f64>().map_err(|error| error.to_string())?;
     if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("not from 0 to 1".to_owned()) }
 }
 
