@@ -62,7 +62,7 @@ proptest! {
         let pose = |x: f64, y: f64, theta: f64| Pose2::new(x * 0.05, y * 0.05, theta);
         let base = [at[0] - cos * reach, at[1] - sin * reach];
         let near = pose(base[0], base[1], theta);
-        let level = Level::new(&map, &table, vec![[reach as f32, 0.0]], (near, reach * 0.05));
+        let level = Level::new(&map, &table, vec![[reach as f32, 0.0]], (near, reach * 0.05 + 1.0));
         let fit = level.fit(near);
         let cost = |x, y, theta| level.fit(pose(x, y, theta)).cost;
         let h = 0.02;

@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use super::super::pose::{Point2, Pose2};
 use super::Cell;
-use super::occupancy::{ScanOutline, Scratch};
-use super::tile_map::{TILE_SIZE, TileKey, TileMap, index_in_tile};
+use super::footprint::Footprint;
+use super::occupancy::ScanOutline;
+use super::tile_map::{TILE_SIZE, TileKey, TileMap};
 
 /// Steps of the fixed-point log-odds in a nat.
 const STEPS: f64 = 4096.0;
@@ -99,12 +100,29 @@ pub struct Evidence {
     pub occupied: LogOdds,
 }
 
+impl Evidence {
+    /// Enters a row of a tile that a scan saw, as bits of its columns.
+    ///
+    /// Evidence of 0 leaves a cell as it is; so all cells of the row are treated alike, at once.
+    fn enter(self, row: &mut [LogOdds; TILE_SIZE], free: u16, hit: u16) {
+        if free | hit == 0 {
+            return;
+        }
+        for (column, value) in row.iter_mut().enumerate() {
+            let bit = 1_u16 << column;
+            let free = if free & bit == 0 { 0 } else { self.free.0 };
+            let hit = if hit & bit == 0 { 0 } else { self.occupied.0 };
+            *value = value.and(LogOdds(free | hit));
+        }
+    }
+}
+
 /// Log-odds over the plane, for cells of one size.
 #[derive(Debug, Clone)]
 pub struct LogOddsMap {
     resolution: f64,
     cells: TileMap<LogOdds>,
-    scratch: Scratch,
+    footprint: Footprint,
 }
 
 impl LogOddsMap {
@@ -116,7 +134,7 @@ impl LogOddsMap {
 
     /// The map with these cells.
     pub(in super::super) fn of_cells(resolution: f64, cells: TileMap<LogOdds>) -> Self {
-        Self { resolution, cells, scratch: Scratch::default() }
+        Self { resolution, cells, footprint: Footprint::default() }
     }
 
     /// Metres a cell.
@@ -132,7 +150,7 @@ impl LogOddsMap {
     }
 
     /// Enters a scan taken with the base at `map_from_base`, and calls `touched` with each tile
-    /// that it changes; some more than once.
+    /// that it changes.
     pub fn add(
         &mut self,
         scan: &ScanOutline,
@@ -140,29 +158,16 @@ impl LogOddsMap {
         evidence: Evidence,
         mut touched: impl FnMut(TileKey),
     ) {
-        self.scratch.outline(scan, map_from_base, self.resolution);
-        let cells = &mut self.cells;
-        let mut row_of_tiles = None;
-        for cell in &self.scratch.hits {
-            let key = TileKey::containing(*cell);
-            let value = &mut cells.tile_mut(key)[index_in_tile(*cell)];
-            *value = value.and(evidence.occupied);
-            if row_of_tiles.replace(key) != Some(key) {
-                touched(key);
-            }
-        }
-        self.scratch.fill(|key, spans| {
+        let Self { resolution, cells, footprint } = self;
+        footprint.of(scan, map_from_base, *resolution, |key, seen| {
             touched(key);
-            let (rows, _) = cells.tile_mut(key).as_chunks_mut::<TILE_SIZE>();
-            for span in spans {
-                let first = index_in_tile(Cell::new(span.start, span.iy));
-                let start = (first % TILE_SIZE) as i16;
-                let end = start + (span.end - span.start) as i16;
-                // All of a row, and some of it unchanged, is quicker than a part of it.
-                for (column, value) in (0..).zip(&mut rows[first / TILE_SIZE]) {
-                    let seen = value.and(evidence.free);
-                    *value = if (start <= column) & (column < end) { seen } else { *value };
-                }
+            let tile = cells.tile_mut(key);
+            if seen.is_free() {
+                return tile.iter_mut().for_each(|value| *value = value.and(evidence.free));
+            }
+            let (rows, _) = tile.as_chunks_mut::<TILE_SIZE>();
+            for ((row, free), hit) in rows.iter_mut().zip(seen.free).zip(seen.hit) {
+                evidence.enter(row, free, hit);
             }
         });
     }

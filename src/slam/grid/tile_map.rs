@@ -86,13 +86,15 @@ impl<C> Page<C> {
 pub struct TileMap<C> {
     /// Ordered by key.
     pages: Vec<(TileKey, Arc<Page<C>>)>,
+    /// The page that was written last; the next tile is often in it, too.
+    last: usize,
 }
 
 impl<C: Copy + Default> TileMap<C> {
     /// A map in which every cell holds the default.
     #[must_use]
     pub const fn new() -> Self {
-        Self { pages: Vec::new() }
+        Self { pages: Vec::new(), last: 0 }
     }
 
     /// The value of one cell.
@@ -111,15 +113,15 @@ impl<C: Copy + Default> TileMap<C> {
     /// A tile to write to: created if missing, copied if shared.
     pub fn tile_mut(&mut self, key: TileKey) -> &mut Tile<C> {
         let page_key = key.page();
-        let index = match self.pages.binary_search_by_key(&page_key, |(page, _)| *page) {
-            Ok(index) => index,
-            Err(index) => {
+        let is_last = self.pages.get(self.last).is_some_and(|(page, _)| *page == page_key);
+        if !is_last {
+            self.last = self.pages.partition_point(|(page, _)| *page < page_key);
+            if self.pages.get(self.last).is_none_or(|(page, _)| *page != page_key) {
                 let empty = Page { tiles: [const { None }; PAGE_SIZE * PAGE_SIZE] };
-                self.pages.insert(index, (page_key, Arc::new(empty)));
-                index
+                self.pages.insert(self.last, (page_key, Arc::new(empty)));
             }
-        };
-        let page = Arc::make_mut(&mut self.pages[index].1);
+        }
+        let page = Arc::make_mut(&mut self.pages[self.last].1);
         let tile =
             page.tiles[key.slot()].get_or_insert_with(|| Arc::new([C::default(); TILE_CELLS]));
         Arc::make_mut(tile)
@@ -228,6 +230,15 @@ impl<'a, C: Copy + Default> Window<'a, C> {
                 .map(|index| tile[index % TILE_CELLS]);
         }
         [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.get(column + dx, row + dy))
+    }
+
+    /// The values of a cell and of those to its right in the same tile; `None` if it was never
+    /// written.
+    #[inline]
+    #[must_use]
+    pub fn rest_of_row(&self, column: usize, row: usize) -> Option<&'a [C]> {
+        let (x, y) = (column % TILE_SIZE, row % TILE_SIZE);
+        Some(&self.tile(column, row)?[y * TILE_SIZE + x..(y + 1) * TILE_SIZE])
     }
 
     /// The value of one cell.

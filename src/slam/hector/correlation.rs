@@ -6,12 +6,14 @@ use super::super::grid::floor;
 use super::super::pose::{Pose2, wrap_angle};
 use super::gauss_newton::{Level, MARGIN, Prior};
 
-/// Hits that are looked at, at most.
+/// Hits that are looked at, at most, ...
 const MOST_POINTS: usize = 180;
+/// ... and how far away they are, at most, cells.
+const FURTHEST_POINT: f32 = 1500.0;
 /// The window reaches this many standard deviations to either side, ...
 const DEVIATIONS: f64 = 3.0;
-/// ... at least this far, cells, ...
-const NEAREST: f64 = 2.0;
+/// ... at least this far: cells, and as far as a turn moves what is seen by cells, ...
+const NEAREST: [f64; 2] = [1.0, 2.0];
 /// ... and at most this far: m and rad.
 const FURTHEST: [f64; 2] = [2.0, 1.2];
 /// A block of poses has this many blocks of the next smaller size along its side, ...
@@ -64,9 +66,9 @@ impl Search<'_> {
     pub fn run(&self) -> Pose2 {
         let cell = self.level.resolution();
         let [reach, turn] = self.deviations.map(|deviation| DEVIATIONS * deviation);
-        let cells = (reach.min(FURTHEST[0]) / cell).clamp(NEAREST, MARGIN) as i32;
+        let cells = (reach.min(FURTHEST[0]) / cell).clamp(NEAREST[0], MARGIN) as i32;
         let angle = cell / self.lever.max(cell);
-        let turns = (turn.min(FURTHEST[1]) / angle).max(NEAREST) as i32;
+        let turns = (turn.min(FURTHEST[1]) / angle).max(NEAREST[1]) as i32;
         let headings: Vec<Turned> =
             (-turns..=turns).map(|heading| self.turned(f64::from(heading) * angle)).collect();
         if cells < FEW {
@@ -93,13 +95,24 @@ impl Search<'_> {
 
     /// The same for a small window, where maxima would cost more than they save.
     fn try_all(&self, headings: &[Turned], cells: i32) -> Pose2 {
+        let side = (2 * cells + 1) as usize;
+        let offsets = |index: usize| ((index % side) as i32 - cells, (index / side) as i32 - cells);
         let mut best = (f64::NEG_INFINITY, self.prior.pose_in_map);
+        let mut sums = vec![0.0; side * side];
         for turned in headings {
-            for (y, x) in (-cells..=cells).flat_map(|y| (-cells..=cells).map(move |x| (y, x))) {
-                let hit = |&(column, row)| self.level.probability(column + x, row + y);
-                let sum: f32 = turned.points.iter().map(hit).sum();
-                let pose = self.moved(turned.pose, (x, y));
-                let likelihood = self.gain * f64::from(sum) - self.prior.cost(pose);
+            sums.fill(0.0);
+            for &(column, row) in &turned.points {
+                for (row, sums) in (row - cells..).zip(sums.chunks_exact_mut(side)) {
+                    self.level.add_probabilities(column - cells, row, sums);
+                }
+            }
+            for (index, sum) in sums.iter().enumerate() {
+                let most = self.gain * f64::from(*sum);
+                if most <= best.0 {
+                    continue;
+                }
+                let pose = self.moved(turned.pose, offsets(index));
+                let likelihood = most - self.prior.cost(pose);
                 if likelihood > best.0 {
                     best = (likelihood, pose);
                 }
@@ -161,10 +174,15 @@ impl Search<'_> {
             (floor(x + cos * px - sin * py), floor(y + sin * px + cos * py))
         };
         let step = points.len().div_ceil(MOST_POINTS).max(1);
-        let points = points.iter().step_by(step).map(in_cell).collect();
+        let points = points.iter().step_by(step).filter(|point| is_near(point));
+        let points = points.map(in_cell).collect();
         let deviation = self.deviations[1];
         Turned { pose, cost: 0.5 * (turn / deviation) * (turn / deviation), points }
     }
+}
+
+fn is_near([x, y]: &[f32; 2]) -> bool {
+    x * x + y * y < FURTHEST_POINT * FURTHEST_POINT
 }
 
 /// For each cell around the scan, the highest probability in a square that begins there.
@@ -182,7 +200,8 @@ const UNKNOWN: f32 = 0.5;
 impl Maxima {
     /// In squares of one cell, for poses up to `cells` away from `pose`.
     fn of(level: &Level<'_>, pose: Pose2, cells: i32) -> Self {
-        let squared = level.points().iter().map(|[x, y]| x * x + y * y).fold(0.0, f32::max);
+        let points = level.points().iter().filter(|point| is_near(point));
+        let squared = points.map(|[x, y]| x * x + y * y).fold(0.0, f32::max);
         let reach = squared.sqrt() as i32 + cells + 2;
         let [left, bottom] = level.in_window(pose).map(|at| floor(at) - reach);
         let width = 2 * reach + 1;

@@ -5,10 +5,11 @@
 //! interpolated occupancy.
 
 use nalgebra::{Matrix3, Vector3};
+use wide::f32x4;
 
 use super::super::grid::Cell;
 use super::super::grid::log_odds::{LogOdds, LogOddsMap, Probabilities};
-use super::super::grid::tile_map::Window;
+use super::super::grid::tile_map::{TILE_SIZE, Window};
 use super::super::pose::{Point2, Pose2, wrap_angle};
 use super::weakness::Weakness;
 
@@ -16,7 +17,9 @@ use super::weakness::Weakness;
 const LONGEST_STEP: f64 = 2.0;
 /// Steps below this, cells, end the search.
 const SHORTEST_STEP: f64 = 0.01;
-/// Room for the pose to move within a window, cells.
+/// Points that are looked at together.
+const LANES: usize = 4;
+/// Room for the pose to move within a window, cells of the coarsest map.
 pub(super) const MARGIN: f64 = 24.0;
 
 /// What is known of a pose before the scan is looked at.
@@ -63,16 +66,15 @@ pub struct Level<'a> {
 }
 
 impl<'a> Level<'a> {
-    /// The part of `map` around a pose in which the points, up to `radius` metres away, may lie.
+    /// The part of `map` up to `reach` metres around a pose, where the points may lie.
     #[must_use]
     pub fn new(
         map: &'a LogOddsMap,
         probabilities: &'a Probabilities,
         points: Vec<[f32; 2]>,
-        (near, radius): (Pose2, f64),
+        (near, reach): (Pose2, f64),
     ) -> Self {
         let resolution = map.resolution();
-        let reach = (radius + MARGIN * resolution).min(1e4);
         let corner = |sign: f64| {
             let at = near.position();
             let at = Point2::new(at.x + sign * reach, at.y + sign * reach);
@@ -114,6 +116,28 @@ impl<'a> Level<'a> {
         self.probabilities.of(self.window.get(column as usize, row as usize))
     }
 
+    /// Adds the probabilities of neighbouring cells of a row, from `column` on.
+    #[inline]
+    pub fn add_probabilities(&self, column: i32, row: i32, mut sums: &mut [f32]) {
+        let (Ok(mut column), Ok(row)) = (usize::try_from(column), usize::try_from(row)) else {
+            return (column..)
+                .zip(sums)
+                .for_each(|(column, sum)| *sum += self.probability(column, row));
+        };
+        while !sums.is_empty() {
+            let in_tile = (TILE_SIZE - column % TILE_SIZE).min(sums.len());
+            let (part, rest) = sums.split_at_mut(in_tile);
+            match self.window.rest_of_row(column, row) {
+                Some(cells) => {
+                    let known = part.iter_mut().zip(cells);
+                    known.for_each(|(sum, cell)| *sum += self.probabilities.of(*cell));
+                }
+                None => part.iter_mut().for_each(|sum| *sum += 0.5),
+            }
+            (column, sums) = (column + in_tile, rest);
+        }
+    }
+
     /// The share of the points that lie in cells of which nothing is known.
     #[must_use]
     pub fn unknown_share(&self, pose: Pose2) -> f64 {
@@ -127,43 +151,62 @@ impl<'a> Level<'a> {
         self.points.iter().filter(unknown).count() as f64 / self.points.len().max(1) as f64
     }
 
-    /// The interpolated occupancy at a point of the window, in cells, and its derivatives.
-    #[inline]
-    fn interpolate(&self, x: f32, y: f32) -> [f32; 3] {
-        let [(column, fx), (row, fy)] = [x, y].map(split);
-        let square = self.window.square(column, row);
-        let [m00, m10, m01, m11] = square.map(|cell| self.probabilities.of(cell));
-        let (bottom, top) = (m10 - m00, m11 - m01);
-        let (left, right) = (m01 - m00, m11 - m10);
-        let dx = bottom + fy * (top - bottom);
-        let dy = left + fx * (right - left);
-        [m00 + fx * bottom + fy * (left + fx * (right - left)), dx, dy]
-    }
-
     /// How the scan fits with the base at `pose`.
     #[must_use]
     pub fn fit(&self, pose: Pose2) -> Fit {
-        let [x, y] = self.in_window(pose).map(|cells| cells as f32);
+        let base = self.in_window(pose).map(|cells| f32x4::splat(cells as f32));
         let (sin, cos) = libm::sincos(pose.theta);
-        let (sin, cos) = (sin as f32, cos as f32);
-        let (mut cost, mut b, mut h) = (0.0_f32, [0.0_f32; 3], [0.0_f32; 6]);
-        for &[px, py] in &self.points {
-            let (rx, ry) = (cos * px - sin * py, sin * px + cos * py);
-            let [m, dx, dy] = self.interpolate(x + rx, y + ry);
-            let turn = rx * dy - ry * dx;
-            let residual = 1.0 - m;
-            cost += residual * residual;
-            b[0] += dx * residual;
-            b[1] += dy * residual;
-            b[2] += turn * residual;
-            h[0] += dx * dx;
-            h[1] += dx * dy;
-            h[2] += dx * turn;
-            h[3] += dy * dy;
-            h[4] += dy * turn;
-            h[5] += turn * turn;
+        let rotation = [sin, cos].map(|value| f32x4::splat(value as f32));
+        let mut sums = [f32x4::ZERO; 10];
+        for points in self.points.chunks(LANES) {
+            self.add(&mut sums, points, (base, rotation));
         }
-        self.in_metres(cost, b, h)
+        self.in_metres(sums.map(|sum| sum.to_array().into_iter().map(f64::from).sum()))
+    }
+
+    /// Adds what up to four points say. Cells are looked up one by one; everything else is done for
+    /// all four at once.
+    #[inline]
+    fn add(
+        &self,
+        sums: &mut [f32x4; 10],
+        points: &[[f32; 2]],
+        ([x, y], [sin, cos]): ([f32x4; 2], [f32x4; 2]),
+    ) {
+        let point = |lane: usize| points.get(lane).copied().unwrap_or_default();
+        let points_at = |axis| f32x4::from([0, 1, 2, 3].map(|lane| point(lane)[axis]));
+        let (px, py) = (points_at(0), points_at(1));
+        let (rx, ry) = (cos * px - sin * py, sin * px + cos * py);
+        let ((columns, fx), (rows, fy)) = (split(x + rx), split(y + ry));
+        // Points that are not there lie in occupied cells, and so say nothing.
+        let mut squares = [[1.0; LANES]; 4];
+        for lane in 0..points.len() {
+            let square = self.window.square(columns[lane], rows[lane]);
+            for (corner, cell) in squares.iter_mut().zip(square) {
+                corner[lane] = self.probabilities.of(cell);
+            }
+        }
+        let [m00, m10, m01, m11] = squares.map(f32x4::from);
+        let (bottom, left) = (m10 - m00, m01 - m00);
+        let dx = bottom + fy * ((m11 - m01) - bottom);
+        let dy = left + fx * ((m11 - m10) - left);
+        let residual = 1.0 - (m00 + fx * bottom + fy * dy);
+        let turn = rx * dy - ry * dx;
+        let products = [
+            residual * residual,
+            dx * residual,
+            dy * residual,
+            turn * residual,
+            dx * dx,
+            dx * dy,
+            dx * turn,
+            dy * dy,
+            dy * turn,
+            turn * turn,
+        ];
+        for (sum, product) in sums.iter_mut().zip(products) {
+            *sum += product;
+        }
     }
 
     /// 1 - (1 - M)² on average over the points.
@@ -172,16 +215,11 @@ impl<'a> Level<'a> {
         1.0 - self.fit(pose).cost / self.points.len().max(1) as f64
     }
 
-    fn in_metres(&self, cost: f32, b: [f32; 3], h: [f32; 6]) -> Fit {
-        let unit = Matrix3::from_diagonal(&Vector3::new(
-            1.0 / self.resolution,
-            1.0 / self.resolution,
-            1.0,
-        ));
-        let b = Vector3::from(b.map(f64::from));
-        let [xx, xy, xt, yy, yt, tt] = h.map(f64::from);
+    fn in_metres(&self, [cost, bx, by, bt, xx, xy, xt, yy, yt, tt]: [f64; 10]) -> Fit {
+        let per_metre = 1.0 / self.resolution;
+        let unit = Matrix3::from_diagonal(&Vector3::new(per_metre, per_metre, 1.0));
         let hessian = Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, tt);
-        Fit { cost: f64::from(cost), descent: unit * b, hessian: unit * hessian * unit }
+        Fit { cost, descent: unit * Vector3::new(bx, by, bt), hessian: unit * hessian * unit }
     }
 
     /// The pose of at most `steps` damped steps from `start` that fits scan and prior best.
@@ -194,6 +232,9 @@ impl<'a> Level<'a> {
         for _ in 0..steps {
             let Some(step) = problem.step(&fit, pose, damping) else { break };
             let step = self.limited(step, problem.lever);
+            if self.length(step, problem.lever) < SHORTEST_STEP {
+                break;
+            }
             let next = moved(pose, step);
             let next_fit = self.fit(next);
             let next_cost = problem.cost(&next_fit, next);
@@ -202,9 +243,6 @@ impl<'a> Level<'a> {
                 damping *= 0.1;
             } else {
                 damping = (damping * 100.0).max(0.1);
-            }
-            if self.length(step, problem.lever) < SHORTEST_STEP {
-                break;
             }
         }
         (pose, fit)
@@ -258,14 +296,14 @@ fn moved(pose: Pose2, step: Vector3<f64>) -> Pose2 {
     Pose2::new(pose.x + step.x, pose.y + step.y, wrap_angle(pose.theta + step.z))
 }
 
-/// The cell whose centre is the last before a position in cells, and how far behind it that is,
-/// 0 to 1. Positions below 0.5 have a cell beyond all windows.
+/// The cells whose centres are the last before positions in cells, and how far behind them those
+/// are, 0 to 1. Positions below 0.5 have a cell beyond all windows.
 ///
 /// As `floor`, but without its branches: adding 2^23 leaves no room for digits behind the point.
 #[inline]
-fn split(position: f32) -> (usize, f32) {
-    const SHIFT: f32 = 8_388_608.0;
-    let shifted = position - 1.0 + SHIFT;
-    let cell = shifted.to_bits() & 0x007f_ffff;
-    (cell as usize, position - 0.5 - (shifted - SHIFT))
+fn split(positions: f32x4) -> ([usize; LANES], f32x4) {
+    let shift = f32x4::splat(8_388_608.0);
+    let shifted = positions - 1.0 + shift;
+    let cells = shifted.to_array().map(|cell| (cell.to_bits() & 0x007f_ffff) as usize);
+    (cells, positions - 0.5 - (shifted - shift))
 }

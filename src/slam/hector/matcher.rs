@@ -27,7 +27,7 @@ const LEAST_EXPLAINED: f64 = 0.7;
 const GAIN: f64 = 1.0;
 /// What a residual tells, once the pose is found: this makes the squared error, normalized,
 /// what it should be in rooms and buildings, at noise of 1 cm and 3 cm and cells of 2.5 cm and 5 cm.
-const CERTAINTY: f64 = 2.05;
+const CERTAINTY: f64 = 2.1;
 /// What a hit in an occupied cell is worth to the search, nats.
 const SEARCH_GAIN: f64 = 1.0;
 

@@ -2,6 +2,7 @@
 
 use super::super::deskew::Velocity;
 use super::super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
+use super::super::known_poses::FURTHEST_CELL;
 use super::super::pose::Point2;
 use super::super::scan::{Beam, LaserMount, Scan, ScanGeometry};
 use super::Parameters;
@@ -64,7 +65,7 @@ impl Directions {
     ) -> PreparedScan {
         self.point(scan, mount);
         let geometry = &scan.geometry;
-        let limit = parameters.max_range;
+        let limit = parameters.max_range.min(FURTHEST_CELL * parameters.resolution);
         let sensor = mount.base_from_laser.position();
         let end = |(index, (range, [cos, sin])): (usize, (&f32, &[f64; 2]))| {
             let (range, kind) = match geometry.classify(*range) {

@@ -5,8 +5,11 @@ use super::super::grid::log_odds::{Evidence, LogOdds, LogOddsMap, Probabilities}
 use super::super::grid::tile_map::{TileCounts, TileKey, TileMap};
 use super::super::pose::Pose2;
 use super::Parameters;
-use super::gauss_newton::Level;
+use super::gauss_newton::{Level, MARGIN};
 use super::prepared_scan::PreparedScan;
+
+/// A coarse map only leads to where the finest decides: so many points are enough.
+const COARSE_POINTS: usize = 180;
 
 /// The maps, finest first.
 #[derive(Debug, Clone)]
@@ -93,10 +96,14 @@ impl Pyramid {
         scan: &'a PreparedScan,
         near: Pose2,
     ) -> impl Iterator<Item = Level<'a>> {
-        let radius = scan.radius();
-        self.maps.iter().rev().map(move |map| {
-            let points = scan.points(map.resolution());
-            Level::new(map, &self.probabilities, points, (near, radius))
+        let coarsest = self.maps.last().map_or(0.0, LogOddsMap::resolution);
+        let reach = scan.radius() + MARGIN * coarsest;
+        self.maps.iter().enumerate().rev().map(move |(level, map)| {
+            let mut points = scan.points(map.resolution());
+            if level > 0 {
+                points = thinned(points);
+            }
+            Level::new(map, &self.probabilities, points, (near, reach))
         })
     }
 
@@ -105,4 +112,9 @@ impl Pyramid {
     pub fn tiles(&self) -> TileCounts {
         TileCounts::of(self.maps.iter().map(LogOddsMap::cells))
     }
+}
+
+fn thinned(points: Vec<[f32; 2]>) -> Vec<[f32; 2]> {
+    let every = points.len().div_ceil(COARSE_POINTS).max(1);
+    if every == 1 { points } else { points.into_iter().step_by(every).collect() }
 }

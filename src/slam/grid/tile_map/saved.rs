@@ -72,7 +72,8 @@ impl<C: Copy + Default> SavedMaps<C> {
                 let page = pages.get(index as usize).ok_or(StateError::Unsound(PARTS))?;
                 Ok((key, Arc::clone(page)))
             };
-            Ok(TileMap { pages: saved.iter().map(page).collect::<Result<_, _>>()? })
+            let pages = saved.iter().map(page).collect::<Result<_, _>>()?;
+            Ok(TileMap { pages, ..TileMap::new() })
         };
         self.maps.iter().map(map).collect()
     }

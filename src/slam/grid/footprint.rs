@@ -1,0 +1,313 @@
+//! Which cells a scan saw: those that beams ended in, and those that are free, whose centres lie
+//! inside the polygon that the beams have crossed.
+
+use std::f64::consts::TAU;
+
+use super::super::pose::{Point2, Pose2};
+use super::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
+use super::tile_map::{TILE_SIZE, TileKey};
+use super::{Cell, floor};
+
+/// Neighbouring beams further apart than this say nothing about what lies between them, rad.
+const WIDEST_WEDGE: f64 = 0.6;
+/// A beam that has no neighbour is as wide as beams are apart, and at most this, rad.
+const WIDEST_BEAM: f64 = 0.04;
+
+/// What a scan saw of a tile: for each row a bit for each column, the lowest for the first. No cell
+/// is both.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Seen {
+    /// Cells that beams passed.
+    pub(super) free: [u16; TILE_SIZE],
+    /// Cells that beams ended in.
+    pub(super) hit: [u16; TILE_SIZE],
+}
+
+impl Seen {
+    /// Whether every cell is free.
+    pub(super) fn is_free(&self) -> bool {
+        self.free == [u16::MAX; TILE_SIZE]
+    }
+}
+
+/// Finds the cells; its buffers keep their memory from scan to scan.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Footprint {
+    /// Of the free polygon, in cells.
+    corners: Vec<Point2>,
+    hits: Vec<Cell>,
+    /// Where the polygon crosses the middle of each row of cells.
+    rows: Vec<Vec<Crossing>>,
+    /// The hits in each row of tiles.
+    hits_by_row: Vec<Vec<Cell>>,
+    /// The row of tiles that is looked at.
+    columns: Vec<Column>,
+}
+
+/// Where an edge of the polygon crosses the middle of a row of cells.
+#[derive(Debug, Clone, Copy)]
+struct Crossing {
+    /// In cells.
+    x: f64,
+    /// 1 for an edge that goes up, -1 for one that goes down.
+    direction: i32,
+}
+
+/// A tile of the row of tiles that is looked at.
+#[derive(Debug, Clone, Copy, Default)]
+struct Column {
+    seen: Seen,
+    /// Whether it holds anything yet.
+    touched: bool,
+    /// Rows that are free from this tile on to the right, up to the next where their bit is set.
+    toggled: u16,
+}
+
+impl Footprint {
+    /// Calls `take` with what the scan saw of each tile, taken with the base at `map_from_base`, for
+    /// cells of `resolution` metres.
+    pub(super) fn of(
+        &mut self,
+        scan: &ScanOutline,
+        map_from_base: Pose2,
+        resolution: f64,
+        mut take: impl FnMut(TileKey, &Seen),
+    ) {
+        self.outline(scan, map_from_base, resolution);
+        let (low, high) = self.bounds();
+        self.fill_rows(low, high);
+        let (rows, _) = self.rows.as_chunks_mut::<TILE_SIZE>();
+        for ((ty, rows), hits) in (low.ty..=high.ty).zip(rows).zip(&mut self.hits_by_row) {
+            for (row, crossings) in rows.iter_mut().enumerate() {
+                sort(crossings);
+                for_each_inside(crossings, |start, end| {
+                    push_free(&mut self.columns, low.tx, row, (start, end));
+                });
+                crossings.clear();
+            }
+            for hit in hits.drain(..) {
+                let (tile, column) = place(hit.ix);
+                self.columns[(tile - low.tx) as usize].push_hit(place(hit.iy).1, column);
+            }
+            let mut whole = 0;
+            for (tx, column) in (low.tx..=high.tx).zip(&mut self.columns) {
+                whole ^= std::mem::take(&mut column.toggled);
+                if whole != 0 || column.touched {
+                    take(TileKey { ty, tx }, &column.finish(whole));
+                }
+            }
+        }
+    }
+
+    /// Finds the free polygon's corners, and the cells that beams end in.
+    fn outline(&mut self, scan: &ScanOutline, map_from_base: Pose2, resolution: f64) {
+        let (sin, cos) = libm::sincos(map_from_base.theta);
+        let per_metre = 1.0 / resolution;
+        let to_cells = |x: f64, y: f64| {
+            Point2::new(
+                (map_from_base.x + cos * x - sin * y) * per_metre,
+                (map_from_base.y + sin * x + cos * y) * per_metre,
+            )
+        };
+        let sensor = to_cells(scan.sensor.x, scan.sensor.y);
+        let end = |end: &BeamEnd| to_cells(f64::from(end.point[0]), f64::from(end.point[1]));
+        self.corners.clear();
+        self.corners.push(sensor);
+        self.hits.clear();
+        let closes = (scan.ends.len() as f64 + 0.5) * scan.angle_increment >= TAU;
+        let around = scan.ends.last().filter(|_| closes);
+        let mut previous = around.and_then(|beam| Arm::of(beam, sensor, end(beam)));
+        let after = scan.ends.iter().skip(1).chain(scan.ends.first().filter(|_| closes));
+        let mut after = after.map(|beam| beam.kind != BeamEndKind::Nothing);
+        for beam in &scan.ends {
+            let end = end(beam);
+            if beam.kind == BeamEndKind::Hit {
+                self.hits.push(Cell::containing(end, 1.0));
+            }
+            let current = Arm::of(beam, sensor, end);
+            let has_next = after.next().unwrap_or(false);
+            let near = scan.angle_increment <= WIDEST_WEDGE;
+            match (previous.filter(|_| near), current) {
+                (Some(a), Some(b)) => self.corners.extend(Arm::wedge(sensor, a, b)),
+                (None, Some(alone)) if !(has_next && near) => {
+                    let half_width = 0.5 * scan.angle_increment.min(WIDEST_BEAM);
+                    self.corners.push(sensor);
+                    self.corners.extend(alone.beam(sensor, half_width));
+                }
+                _ => self.corners.push(sensor),
+            }
+            previous = current;
+        }
+        self.hits.dedup();
+    }
+
+    /// The first and the last tile that anything lies in, or past it.
+    fn bounds(&self) -> (TileKey, TileKey) {
+        let first = (self.corners[0], self.corners[0]);
+        let (low, high) = self.corners.iter().fold(first, |(low, high), p| {
+            (
+                Point2::new(low.x.min(p.x), low.y.min(p.y)),
+                Point2::new(high.x.max(p.x), high.y.max(p.y)),
+            )
+        });
+        let cells = (Cell::containing(low, 1.0), Cell::containing(high, 1.0));
+        let (low, high) = self.hits.iter().fold(cells, |(low, high), hit| {
+            (
+                Cell::new(low.ix.min(hit.ix), low.iy.min(hit.iy)),
+                Cell::new(high.ix.max(hit.ix), high.iy.max(hit.iy)),
+            )
+        });
+        // Rows that are free up to the last column end in the next.
+        (TileKey::containing(low), TileKey::containing(Cell::new(high.ix + 1, high.iy)))
+    }
+
+    /// Sorts crossings by rows, and hits by rows of tiles.
+    fn fill_rows(&mut self, low: TileKey, high: TileKey) {
+        let height = (high.ty - low.ty + 1) as usize;
+        let width = (high.tx - low.tx + 1) as usize;
+        grow(&mut self.rows, height * TILE_SIZE);
+        grow(&mut self.hits_by_row, height);
+        grow(&mut self.columns, width);
+        let bottom = low.first_cell().iy;
+        let next = self.corners.iter().cycle().skip(1);
+        for (a, b) in self.corners.iter().zip(next) {
+            cross_rows(&mut self.rows, bottom, *a, *b);
+        }
+        for hit in &self.hits {
+            self.hits_by_row[(place(hit.iy).0 - low.ty) as usize].push(*hit);
+        }
+    }
+}
+
+fn grow<T: Clone + Default>(buffer: &mut Vec<T>, length: usize) {
+    buffer.resize(buffer.len().max(length), T::default());
+}
+
+/// The tile that a row or column lies in, and where there.
+const fn place(index: i32) -> (i32, usize) {
+    (index.div_euclid(TILE_SIZE as i32), index.rem_euclid(TILE_SIZE as i32) as usize)
+}
+
+impl Column {
+    fn push_free(&mut self, row: usize, columns: u16) {
+        self.seen.free[row] |= columns;
+        self.touched = true;
+    }
+
+    fn push_hit(&mut self, row: usize, column: usize) {
+        self.seen.hit[row] |= 1 << column;
+        self.touched = true;
+    }
+
+    /// What was seen, with the rows that are free as a whole; begins anew.
+    fn finish(&mut self, whole_rows: u16) -> Seen {
+        self.touched = false;
+        let mut seen = std::mem::take(&mut self.seen);
+        for row in 0..TILE_SIZE {
+            let whole = if whole_rows & 1 << row == 0 { 0 } else { u16::MAX };
+            // An obstacle beats free space within a scan.
+            seen.free[row] = (seen.free[row] | whole) & !seen.hit[row];
+        }
+        seen
+    }
+}
+
+/// Takes the cells of a row from `start` up to `end`, not included, as free.
+fn push_free(columns: &mut [Column], left: i32, row: usize, (start, end): (i32, i32)) {
+    if start >= end {
+        return;
+    }
+    let ((first, start), (last, end)) = (place(start), place(end));
+    let (first, last) = ((first - left) as usize, (last - left) as usize);
+    let (from_start, before_end) = (u16::MAX << start, !(u16::MAX << end));
+    if first == last {
+        return columns[first].push_free(row, from_start & before_end);
+    }
+    columns[first].push_free(row, from_start);
+    if before_end != 0 {
+        columns[last].push_free(row, before_end);
+    }
+    columns[first + 1].toggled ^= 1 << row;
+    columns[last].toggled ^= 1 << row;
+}
+
+/// From the sensor to the end of a beam, in cells.
+#[derive(Debug, Clone, Copy)]
+struct Arm {
+    direction: Point2,
+    squared: f64,
+}
+
+impl Arm {
+    /// `None` if the beam says nothing.
+    fn of(beam: &BeamEnd, sensor: Point2, end: Point2) -> Option<Self> {
+        let (x, y) = (end.x - sensor.x, end.y - sensor.y);
+        (beam.kind != BeamEndKind::Nothing)
+            .then(|| Self { direction: Point2::new(x, y), squared: x * x + y * y })
+    }
+
+    /// The outer corners of the triangle that two neighbouring beams know to be free: as long as
+    /// the shorter of them, since nothing is known behind an edge that only one has passed.
+    fn wedge(sensor: Point2, a: Self, b: Self) -> [Point2; 2] {
+        let (shorter, longer) = (a.squared.min(b.squared), a.squared.max(b.squared));
+        let share = if longer > 0.0 { (shorter / longer).sqrt() } else { 0.0 };
+        [a, b].map(|Self { direction, squared }| {
+            let share = if squared > shorter { share } else { 1.0 };
+            Point2::new(sensor.x + share * direction.x, sensor.y + share * direction.y)
+        })
+    }
+
+    /// The outer corners of a beam to both sides of the arm, for small angles.
+    fn beam(self, sensor: Point2, half_width: f64) -> [Point2; 2] {
+        let Point2 { x, y } = self.direction;
+        [-half_width, half_width]
+            .map(|turn| Point2::new(sensor.x + x - turn * y, sensor.y + y + turn * x))
+    }
+}
+
+/// Notes where the edge from `a` to `b` crosses the middles of rows, and which way.
+fn cross_rows(rows: &mut [Vec<Crossing>], bottom: i32, a: Point2, b: Point2) {
+    let (low, high, direction) = if a.y < b.y { (a, b, 1) } else { (b, a, -1) };
+    let (start, end) = (first_centre(low.y), first_centre(high.y));
+    if start >= end {
+        return;
+    }
+    let slope = (high.x - low.x) / (high.y - low.y);
+    let rows = &mut rows[(start - bottom) as usize..(end - bottom) as usize];
+    for (iy, row) in (start..).zip(rows) {
+        let x = low.x + slope * (f64::from(iy) + 0.5 - low.y);
+        row.push(Crossing { x, direction });
+    }
+}
+
+/// The first cell whose centre is not before `x`.
+fn first_centre(x: f64) -> i32 {
+    -floor(0.5 - x)
+}
+
+/// From left to right. Beams come in the order of their angles, and so the crossings of a row are
+/// nearly sorted one way or the other.
+fn sort(crossings: &mut [Crossing]) {
+    if let [first, .., last] = crossings
+        && first.x > last.x
+    {
+        crossings.reverse();
+    }
+    crossings.sort_by(|a, b| a.x.total_cmp(&b.x));
+}
+
+/// Calls `take` with the first and one past the last cell of each stretch inside the polygon, by
+/// the non-zero winding rule: beams that overlap after a full turn do not cancel each other.
+fn for_each_inside(crossings: &[Crossing], mut take: impl FnMut(i32, i32)) {
+    let mut winding = 0;
+    let mut from = 0.0;
+    for crossing in crossings {
+        if winding == 0 {
+            from = crossing.x;
+        }
+        winding += crossing.direction;
+        if winding == 0 {
+            take(first_centre(from), first_centre(crossing.x));
+        }
+    }
+}
