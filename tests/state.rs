@@ -12,6 +12,7 @@ use gmapd::convert::{self, OdometrySample};
 use gmapd::daemon::checkpointing::Checkpoint;
 use gmapd::ros;
 use gmapd::sim::{self, Place, Scenario, Simulation};
+use gmapd::slam::pose::{Pose2, Stamp};
 use gmapd::slam::scan::LaserMount;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -36,15 +37,22 @@ struct Moment {
 
 /// The first moments of a drive through a building.
 fn drive(moments: usize) -> Vec<Moment> {
+    drive_after(moments, 0, Pose2::IDENTITY)
+}
+
+/// The same drive so many seconds later, with an odometry that has its origin elsewhere.
+fn drive_after(moments: usize, seconds: i64, odom_from_before: Pose2) -> Vec<Moment> {
     let scenario = Scenario { beams: 60, ..Scenario::new(Place::Building, 3) };
     let mut simulation = Simulation::new(&scenario).unwrap();
     simulation.lidar.mount = LaserMount::default();
-    let moment = |reading: sim::Reading| {
+    let moment = |mut reading: sim::Reading| {
+        let stamp = Stamp(reading.stamp.0 + seconds * 1_000_000_000);
+        (reading.stamp, reading.scan.stamp) = (stamp, stamp);
         let odometry = OdometrySample {
             stamp: reading.stamp,
             odom_frame: "odom".to_owned(),
             base_frame: "base_link".to_owned(),
-            odom_from_base: reading.odom_from_base,
+            odom_from_base: odom_from_before * reading.odom_from_base,
         };
         Moment {
             odometry: ros::cdr(&convert::odometry_message(&odometry)),
@@ -185,6 +193,13 @@ impl Robot {
             assert!(start.elapsed() < PATIENCE, "{status}");
             tokio::task::yield_now().await;
         }
+    }
+
+    /// Where the robot is.
+    async fn pose(&self) -> Pose2 {
+        let pose = &self.status().await["pose_in_map"];
+        let [x, y, theta] = ["x", "y", "theta"].map(|axis| pose[axis].as_f64().unwrap());
+        Pose2::new(x, y, theta)
     }
 
     /// The map's picture and the path.
@@ -569,4 +584,91 @@ async fn a_map_goes_on_in_the_mode_that_was_configured_or_commanded_last() {
     let daemon = Daemon::start(&mesh, &robot, &localizing).await;
     assert_eq!(robot.status().await["mode"], "localization");
     daemon.terminate(&robot).await;
+}
+
+/// Metres between two poses.
+fn apart(a: Pose2, b: Pose2) -> f64 {
+    (a.x - b.x).hypot(a.y - b.y)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_was_carried_is_where_it_is_said_to_be() {
+    let mesh = Mesh::new().await;
+    let moments = drive(80);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.feed_all(&moments[..20]).await;
+        let Pose2 { x, y, theta } = robot.pose().await;
+        robot.feed_all(&moments[20..60]).await;
+        let there = robot.pose().await;
+        robot.feed_all(&moments[60..]).await;
+        daemon.terminate(&robot).await;
+
+        // As an operator points at where it was after 20 moments; odometry has another origin.
+        let given = format!("{},{},{theta}", x + 0.1, y - 0.1);
+        let said = [engine, &["--initial-pose", given.as_str()][..]].concat();
+        let again = drive_after(60, 1000, Pose2::new(7.0, -2.0, 1.3));
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        assert_ne!(robot.status().await["checkpoint"]["resumed_from"], Value::Null);
+        assert!(apart(robot.pose().await, Pose2::new(x + 0.1, y - 0.1, theta)) < 1e-6);
+        robot.until_checkpoint(|status| status["written"] == 1).await;
+        daemon.kill(&robot).await;
+
+        // A pose that is said already says nothing new, in which checkpoint it may be.
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        robot.feed_all(&again[20..]).await;
+        let pose = robot.pose().await;
+        assert!(apart(pose, there) < 0.25, "{engine:?}: {pose:?}, and not {there:?}");
+        daemon.terminate(&robot).await;
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        assert!(apart(robot.pose().await, pose) < 1e-6);
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_place_of_a_robot_that_was_carried_is_searched_for_in_its_map() {
+    let mesh = Mesh::new().await;
+    let moments = drive(80);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let search = [engine, &["--initial-pose", "search"][..]].concat();
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.feed_all(&moments[..40]).await;
+        let there = robot.pose().await;
+        robot.feed_all(&moments[40..]).await;
+        let area = robot.status().await["map"]["known_area_m2"].clone();
+        daemon.terminate(&robot).await;
+
+        let daemon = Daemon::start(&mesh, &robot, &search).await;
+        let error = robot.ask("pose").await.unwrap_err();
+        assert!(error.starts_with("the pose is not known yet"), "{error}");
+        robot.until_checkpoint(|status| status["written"] == 1).await;
+        daemon.kill(&robot).await;
+
+        // Until its place is found, each restart goes on searching.
+        let again = drive_after(41, 1000, Pose2::new(7.0, -2.0, 1.3));
+        let blind = Moment { scan: no_walls(&again[20]), ..again[20].clone() };
+        let daemon = Daemon::start(&mesh, &robot, &search).await;
+        assert!(robot.ask("pose").await.is_err());
+        assert_eq!(robot.feed(&blind).await.unwrap(), "not_localized");
+        let status = robot.status().await;
+        assert_eq!(status["state"], "not_localized", "{status}");
+        assert_eq!(status["map"]["known_area_m2"], area);
+        let verdicts = robot.feed_all(&again[21..40]).await;
+        assert!(verdicts.contains(&"processed".to_owned()), "{verdicts:?}");
+        let pose = robot.pose().await;
+        assert!(apart(pose, there) < 0.25, "{engine:?}: {pose:?}, and not {there:?}");
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
+}
+
+/// The scan of a moment with all walls at one distance, as there are nowhere.
+fn no_walls(moment: &Moment) -> Vec<u8> {
+    let mut scan: ros::LaserScan = ros::decode(&moment.scan, "").unwrap();
+    scan.ranges = vec![2.0; scan.ranges.len()];
+    ros::cdr(&scan)
 }

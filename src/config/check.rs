@@ -57,10 +57,16 @@ fn check_start(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError> {
     let (key, reason) = match (raw.engine, &raw.map) {
         (EngineKind::KnownPoses, Some(_)) => ("map", "known_poses starts from no map"),
         (EngineKind::KnownPoses, None) if localizes => ("mode", "to known_poses, poses are given"),
+        (EngineKind::KnownPoses, None) if searches => {
+            ("initial_pose", "to known_poses, poses are given")
+        }
         (_, None) if localizes && raw.state_directory.is_none() => {
             ("mode", "a map to localize in is needed: --map, or map, or --state of a run before")
         }
-        (_, None) if searches => ("initial_pose", "a map to search is needed: --map, or map"),
+        (_, None) if searches && raw.state_directory.is_none() => {
+            let reason = "a map to search is needed: --map, or map, or --state of a run before";
+            ("initial_pose", reason)
+        }
         _ => return Ok(()),
     };
     Err(wrong_kind(entries, key, reason))

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::{gmapping::Parameters, hector, known_map::Mode};
+use crate::slam::{gmapping::Parameters, hector, known_map::Mode, pose::Pose2};
 
 /// All keys of the file. A key that is left out has slam_gmapping's default.
 ///
@@ -410,6 +410,12 @@ pub enum Search {
 }
 
 impl InitialPose {
+    /// The pose of the base in `map`, if one is said.
+    #[must_use]
+    pub fn pose(self) -> Option<Pose2> {
+        self.numbers().map(|[x, y, yaw]| Pose2::new(x, y, yaw))
+    }
+
     /// The numbers, if there are any.
     #[must_use]
     pub const fn numbers(self) -> Option<[f64; 3]> {

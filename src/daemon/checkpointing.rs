@@ -212,12 +212,14 @@ pub(super) fn attach(
     let config::Checkpoint { every_s, every_scans, keep } = config.raw.checkpoint;
     let store = Store::new(directory.as_ref(), keep)?;
     let own = own_head(config, prefix);
-    let status = resume(mapper, store.directory(), &own);
+    let (status, head) = resume(mapper, store.directory(), &own);
     let knows_a_map = status.resumed_from.is_some() || config.raw.map.is_some();
     if config.raw.mode == Mode::Localization && !knows_a_map {
         let directory = store.directory().to_owned();
         return Err(CheckpointsError::NothingToLocalizeIn { directory });
     }
+    // Where the robot was said to be is written at once: from the next restart on it is old.
+    let commanded = head.is_some_and(|head| head.has_other_pose(&own));
     let status = Arc::new(Mutex::new(status));
     let (jobs, waiting) = channel();
     let pending = Arc::new(AtomicUsize::new(0));
@@ -226,7 +228,7 @@ pub(super) fn attach(
     thread.spawn(move || writer.run(&waiting)).map_err(CheckpointsError::Thread)?;
     let every = Duration::from_secs_f64(every_s);
     let last = (clock::now(), mapper.scans());
-    mapper.keep_state(Keeper { jobs, pending, every, every_scans, last, commanded: false });
+    mapper.keep_state(Keeper { jobs, pending, every, every_scans, last, commanded });
     Ok(Some(status))
 }
 
@@ -247,12 +249,13 @@ fn own_head(config: &Config, prefix: &Prefix) -> Head {
         particles: 0,
         stamp: None,
         map: None,
+        searching: false,
         body_bytes: 0,
     }
 }
 
-/// Goes on from the newest checkpoint that is good and of this daemon's kind.
-fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus {
+/// Goes on from the newest checkpoint that is good and of this daemon's kind, and has its head.
+fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> (CheckpointStatus, Option<Head>) {
     let mut status = CheckpointStatus {
         directory: directory.to_owned(),
         resumed_from: None,
@@ -269,7 +272,7 @@ fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus
                 tracing::info!("going on from {path}, with {scans} scans in the map");
                 status.resumed_stamp = head.stamp;
                 status.resumed_from = Some(name(&path.to_string()));
-                break;
+                return (status, Some(head));
             }
             Err(refusal) => {
                 tracing::warn!("{} is not gone on from: {refusal}", path.display());
@@ -278,10 +281,8 @@ fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus
             }
         }
     }
-    if status.resumed_from.is_none() {
-        tracing::info!("no state to go on from in {}: mapping begins anew", directory.display());
-    }
-    status
+    tracing::info!("no state to go on from in {}: mapping begins anew", directory.display());
+    (status, None)
 }
 
 fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Refusal> {
@@ -293,6 +294,12 @@ fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Ref
     // Otherwise it is as the last command left it.
     if opened.head.settings.get(MODE) != own.settings.get(MODE) {
         mapper.take_configured_mode();
+    }
+    if opened.head.searching {
+        mapper.search_pose();
+    }
+    if opened.head.has_other_pose(own) {
+        mapper.take_configured_pose();
     }
     Ok(opened.head)
 }
@@ -355,6 +362,7 @@ impl Writer {
             particles: engine.hypotheses().len() as u64,
             stamp: mapper.taken(),
             map,
+            searching: engine.is_searching(),
             ..self.own.clone()
         };
         (head, engine.state())

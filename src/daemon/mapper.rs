@@ -21,7 +21,7 @@ use super::synchronizer::{
     self, Call, Channel, Need, ReadyScan, Refusal, ScanCounts, Sought, Synchronizer,
 };
 use crate::clock::{self, Stopwatch};
-use crate::config::{Config, EngineKind, OdometrySource};
+use crate::config::{Config, EngineKind, InitialPose, OdometrySource};
 use crate::convert::FramedPose;
 use crate::slam::engine::{Engine, Sweep};
 use crate::slam::known_map::Mode;
@@ -101,8 +101,8 @@ pub struct Gauges {
 pub struct Mapper {
     connections: Connections,
     engine: Engine,
-    /// As configured: where the first scan is, and what a jump is.
-    initial_pose: Option<Pose2>,
+    /// As configured: where the robot is at first, and what a jump is.
+    initial_pose: Option<InitialPose>,
     first_mode: Mode,
     jump: JumpGuard,
     /// Seconds between two versions of the map while scans wait.
@@ -208,7 +208,7 @@ impl Mapper {
         let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
-            initial_pose: parameters.initial_pose,
+            initial_pose: config.raw.initial_pose,
             first_mode: config.raw.mode,
             jump: parameters.jump,
             map_update_interval: config.raw.map_update_interval,
@@ -453,7 +453,8 @@ impl Mapper {
         let estimate = &mut self.view.estimate;
         estimate.pose_in_map = self.engine.pose_in_map();
         estimate.map_from_odom = self.engine.map_from_odom();
-        estimate.stamp = if self.engine.has_begun() { stamp } else { None };
+        let known = self.engine.has_begun() && !self.engine.is_searching();
+        estimate.stamp = stamp.filter(|_| known);
         self.view.changed = true;
         self.follow_odometry();
     }
@@ -547,7 +548,8 @@ impl Mapper {
 
     fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
         let epoch = self.epoch() + 1;
-        self.engine.reset(pose_in_map.or(self.initial_pose));
+        let pose_in_map = pose_in_map.or(self.initial_pose.and_then(InitialPose::pose));
+        self.engine.reset(pose_in_map);
         self.engine.set_mode(self.first_mode);
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
@@ -559,7 +561,7 @@ impl Mapper {
         self.gauges.weakness.clear();
         self.show_start();
         self.renew_estimate(None);
-        let at = match pose_in_map.or(self.initial_pose) {
+        let at = match pose_in_map {
             Some(pose) => format!("at {}", in_words(pose)),
             None if self.view.map.is_some() => "where it fits".to_owned(),
             None => "where odometry says".to_owned(),

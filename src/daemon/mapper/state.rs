@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Gauges, Mapper, View};
 use crate::clock;
+use crate::config::InitialPose;
 use crate::daemon::frames::FramesState;
 use crate::daemon::ledger::Ledger;
 use crate::daemon::snapshot::Estimate;
@@ -109,6 +110,31 @@ impl Mapper {
         }
         self.publish();
         Ok(())
+    }
+
+    /// Takes the robot to be where the configuration says, if it does, and not where the state has
+    /// it; or searches for its place in the map.
+    pub fn take_configured_pose(&mut self) {
+        match self.initial_pose {
+            None => {}
+            Some(InitialPose::At([x, y, yaw])) => {
+                let (done, _) = self.set_pose(Pose2::new(x, y, yaw));
+                tracing::info!("initial_pose is another than before: {done}");
+            }
+            Some(InitialPose::Search(_)) => {
+                tracing::info!("the robot's place in the map is searched for");
+                self.search_pose();
+            }
+        }
+        self.publish();
+    }
+
+    /// Searches for the robot's place in the map; until it is found, no pose is told.
+    pub fn search_pose(&mut self) {
+        self.engine.search_pose();
+        self.view.estimate.particles = Arc::new([]);
+        self.renew_estimate(None);
+        self.publish();
     }
 
     /// Maps or localizes as the configuration says, and not as the state did.
