@@ -553,17 +553,8 @@ async fn a_map_goes_on_in_the_mode_that_was_configured_or_commanded_last() {
 
     let localizing = ["--set", "mode=localization", "--set", "commands_per_second=3"];
     let empty = tempfile::tempdir().unwrap();
-    let refused = Command::new(env!("CARGO_BIN_EXE_gmapd"))
-        .args(["run", "--zenoh"])
-        .arg(&mesh.configuration)
-        .arg("--state")
-        .arg(empty.path())
-        .args(localizing)
-        .output()
-        .unwrap();
-    assert_eq!(refused.status.code(), Some(1));
-    let error = String::from_utf8(refused.stderr).unwrap();
-    assert!(error.contains("has no state of this robot to go on from"), "{error}");
+    let error = complaint(&mesh, empty.path(), &localizing);
+    assert!(error.contains("has no state of this robot with a map to go on from"), "{error}");
     let daemon = Daemon::start(&mesh, &robot, &localizing).await;
     let status = robot.status().await;
     assert_eq!(status["mode"], "localization");
@@ -671,4 +662,49 @@ fn no_walls(moment: &Moment) -> Vec<u8> {
     let mut scan: ros::LaserScan = ros::decode(&moment.scan, "").unwrap();
     scan.ranges = vec![2.0; scan.ranges.len()];
     ros::cdr(&scan)
+}
+
+/// What a daemon says that does not start.
+fn complaint(mesh: &Mesh, state: &Path, arguments: &[&str]) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gmapd"));
+    command.args(["run", "--prefix", "robot01", "--zenoh"]).arg(&mesh.configuration);
+    let output = command.arg("--state").arg(state).args(arguments).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_localizes_without_a_map() {
+    let mesh = Mesh::new().await;
+    let moments = drive(30);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let localizing = [engine, &["--mode", "localization"][..]].concat();
+        // Its state has no map.
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.ask("slam/cmd/pause").await.unwrap();
+        robot.feed(&moments[0]).await;
+        daemon.terminate(&robot).await;
+        let set = ["--set", "particles=4", "--set", "linearUpdate=0.3"];
+        let error = complaint(&mesh, &mesh.state("robot01"), &[&localizing, &set[..]].concat());
+        assert!(error.contains("no state of this robot with a map to go on from"), "{error}");
+
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.ask("slam/cmd/resume").await.unwrap();
+        robot.feed_all(&moments[1..10]).await;
+        daemon.terminate(&robot).await;
+        let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+        assert_eq!(robot.status().await["mode"], "localization");
+        let done = String::from_utf8(robot.ask("slam/cmd/reset").await.unwrap()).unwrap();
+        assert!(done.contains("begins a new map"), "{done}");
+        assert_eq!(robot.status().await["mode"], "mapping");
+        daemon.terminate(&robot).await;
+
+        let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+        let verdicts = robot.feed_all(&moments[10..]).await;
+        assert_eq!(verdicts[0], "processed");
+        assert!(robot.status().await["map"]["known_area_m2"].as_f64() > Some(1.0));
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
 }

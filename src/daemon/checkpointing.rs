@@ -21,7 +21,6 @@ use crate::clock::{self, Stopwatch};
 use crate::config::{self, Config, EngineKind};
 use crate::files::WriteError;
 use crate::slam::engine::Engine;
-use crate::slam::known_map::Mode;
 use crate::slam::pose::Stamp;
 use crate::slam::state::EngineState;
 
@@ -109,8 +108,8 @@ pub enum CheckpointsError {
     Store(#[from] StoreError),
     /// There is no state to localize in, and no map either.
     #[error(
-        "mode is localization, and {} has no state of this robot to go on from: map first, or name \
-         a map",
+        "mode is localization, and {} has no state of this robot with a map to go on from: map \
+         first, or name a map",
         directory.display()
     )]
     NothingToLocalizeIn {
@@ -213,8 +212,7 @@ pub(super) fn attach(
     let store = Store::new(directory.as_ref(), keep)?;
     let own = own_head(config, prefix);
     let (status, head) = resume(mapper, store.directory(), &own);
-    let knows_a_map = status.resumed_from.is_some() || config.raw.map.is_some();
-    if config.raw.mode == Mode::Localization && !knows_a_map {
+    if mapper.localizes_in_nothing() {
         let directory = store.directory().to_owned();
         return Err(CheckpointsError::NothingToLocalizeIn { directory });
     }

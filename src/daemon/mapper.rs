@@ -230,10 +230,15 @@ impl Mapper {
     /// A map to start from is told before any scan, so that a pose can be pointed at.
     fn show_start(&mut self) {
         self.view.mode = self.engine.mode();
-        if self.engine.occupancy().counts().tiles().next().is_some() {
+        if self.knows_a_map() {
             self.view.unpublished = Some(Stamp(0));
             self.renew_map();
         }
+    }
+
+    /// Whether there is a map to localize in.
+    pub(super) fn knows_a_map(&mut self) -> bool {
+        self.engine.occupancy().counts().tiles().next().is_some()
     }
 
     /// Works until the mailbox is closed and empty, or later than it may be.
@@ -550,7 +555,9 @@ impl Mapper {
         let epoch = self.epoch() + 1;
         let pose_in_map = pose_in_map.or(self.initial_pose.and_then(InitialPose::pose));
         self.engine.reset(pose_in_map);
-        self.engine.set_mode(self.first_mode);
+        // Without a map to start from, there is none to localize in.
+        let mode = if self.knows_a_map() { self.first_mode } else { Mode::Mapping };
+        self.engine.set_mode(mode);
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
         self.view.paused = before.paused;

@@ -11,6 +11,7 @@ use crate::daemon::frames::FramesState;
 use crate::daemon::ledger::Ledger;
 use crate::daemon::snapshot::Estimate;
 use crate::daemon::synchronizer::state::SynchronizerState;
+use crate::slam::known_map::Mode;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::state::{EngineState, StateError, ensure};
@@ -139,9 +140,15 @@ impl Mapper {
 
     /// Maps or localizes as the configuration says, and not as the state did.
     pub fn take_configured_mode(&mut self) {
-        self.set_mode(self.first_mode);
+        self.engine.set_mode(self.first_mode);
+        self.view.mode = self.engine.mode();
         self.view.changed = true;
         self.publish();
+    }
+
+    /// Whether it is to localize, and there is no map to do so in.
+    pub fn localizes_in_nothing(&mut self) -> bool {
+        self.engine.mode() == Mode::Localization && !self.knows_a_map()
     }
 }
 
