@@ -33,6 +33,7 @@ struct Moment {
     odometry: Vec<u8>,
     scan: Vec<u8>,
     stamp: i64,
+    odom_from_base: Pose2,
 }
 
 /// The first moments of a drive through a building.
@@ -55,6 +56,7 @@ fn drive_after(moments: usize, seconds: i64, odom_from_before: Pose2) -> Vec<Mom
             odom_from_base: odom_from_before * reading.odom_from_base,
         };
         Moment {
+            odom_from_base: odometry.odom_from_base,
             odometry: ros::cdr(&convert::odometry_message(&odometry)),
             scan: ros::cdr(&convert::laser_scan(&reading.scan, "base_link")),
             stamp: reading.stamp.0,
@@ -599,7 +601,7 @@ async fn a_robot_that_was_carried_is_where_it_is_said_to_be() {
         // As an operator points at where it was after 20 moments; odometry has another origin.
         let given = format!("{},{},{theta}", x + 0.1, y - 0.1);
         let said = [engine, &["--initial-pose", given.as_str()][..]].concat();
-        let again = drive_after(60, 1000, Pose2::new(7.0, -2.0, 1.3));
+        let again = drive_after(60, 1000, odometry_elsewhere(&moments));
         let daemon = Daemon::start(&mesh, &robot, &said).await;
         assert_ne!(robot.status().await["checkpoint"]["resumed_from"], Value::Null);
         assert!(apart(robot.pose().await, Pose2::new(x + 0.1, y - 0.1, theta)) < 1e-6);
@@ -640,7 +642,7 @@ async fn the_place_of_a_robot_that_was_carried_is_searched_for_in_its_map() {
         daemon.kill(&robot).await;
 
         // Until its place is found, each restart goes on searching.
-        let again = drive_after(41, 1000, Pose2::new(7.0, -2.0, 1.3));
+        let again = drive_after(41, 1000, odometry_elsewhere(&moments));
         let blind = Moment { scan: no_walls(&again[20]), ..again[20].clone() };
         let daemon = Daemon::start(&mesh, &robot, &search).await;
         assert!(robot.ask("pose").await.is_err());
@@ -707,4 +709,51 @@ async fn nobody_localizes_without_a_map() {
         daemon.kill(&robot).await;
         fs::remove_dir_all(mesh.state("robot01")).unwrap();
     }
+}
+
+/// What takes odometry's poses to such with the origin a few metres from where the robot is.
+fn odometry_elsewhere(moments: &[Moment]) -> Pose2 {
+    Pose2::new(3.0, -2.0, 0.8) * moments[moments.len() - 1].odom_from_base.inverse()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn odometry_that_begins_anew_after_a_power_cut_is_no_motion() {
+    let mesh = Mesh::new().await;
+    let moments = drive_after(120, 1000, Pose2::IDENTITY);
+    let origin = moments[79].odom_from_base;
+    assert!(moments[0].odom_from_base.between(origin).position().norm() > 1.0);
+    let later = |seconds| drive_after(120, seconds, origin.inverse()).split_off(80);
+    for engine in &ENGINES[..2] {
+        let [_, expected] = undisturbed(&mesh, engine, &moments).await;
+        // Stamped later, and by a clock that was set back.
+        for seconds in [2000, 500] {
+            let robot = mesh.robot("robot01").await;
+            let daemon = Daemon::start(&mesh, &robot, engine).await;
+            robot.feed_all(&moments[..80]).await;
+            let before = robot.pose().await;
+            daemon.terminate(&robot).await;
+            let daemon = Daemon::start(&mesh, &robot, engine).await;
+            let anew = later(seconds);
+            robot.feed(&anew[0]).await;
+            robot.feed(&anew[1]).await;
+            robot.feed(&anew[2]).await;
+            let pose = robot.pose().await;
+            assert!(apart(pose, before) < 0.6, "{engine:?} {seconds}: {before:?} to {pose:?}");
+            robot.feed_all(&anew[3..]).await;
+            let status = robot.status().await;
+            assert_eq!(status["filter"]["odometry_restarts"], 1, "{engine:?} {seconds}");
+            let [_, path] = robot.results().await;
+            let [end, expected] = [&path, &expected].map(|path| end_of(path));
+            assert!(apart(end, expected) < 0.3, "{engine:?} {seconds}: {end:?}, not {expected:?}");
+            daemon.kill(&robot).await;
+            fs::remove_dir_all(mesh.state("robot01")).unwrap();
+        }
+    }
+}
+
+/// The last position of a path in TUM's format.
+fn end_of(path: &[u8]) -> Pose2 {
+    let last = std::str::from_utf8(path).unwrap().lines().last().unwrap();
+    let numbers: Vec<f64> = last.split(' ').map(|word| word.parse().unwrap()).collect();
+    Pose2::new(numbers[1], numbers[2], 0.0)
 }

@@ -68,6 +68,9 @@ pub struct Gauges {
     pub laser: Option<LaserMount>,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Times odometry began anew after a restart.
+    #[serde(skip)]
+    pub odometry_restarts: u64,
     /// Where odometry comes from.
     #[serde(skip)]
     pub channel: Option<Channel>,
@@ -373,7 +376,18 @@ impl Mapper {
             }
             Call::Scan(ready) => self.add_scan(&ready),
             Call::Refuse(refusal) => self.refuse(refusal),
+            Call::BeginOdometry(odom_from_base) => self.begin_odometry(odom_from_base),
         }
+    }
+
+    /// The robot is where it was, and odometry counts from there.
+    fn begin_odometry(&mut self, odom_from_base: Pose2) {
+        let place = in_words(odom_from_base);
+        tracing::warn!("odometry begins anew at {place}: it is no motion of the robot");
+        self.gauges.odometry_restarts += 1;
+        self.engine.forget_odometry();
+        self.add_odometry(odom_from_base);
+        self.renew_estimate(self.view.estimate.stamp);
     }
 
     fn add_odometry(&mut self, odom_from_base: Pose2) {

@@ -106,6 +106,8 @@ pub struct FilterStatus {
     pub resamples: u64,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Times odometry began anew after a restart, as after a power cut; 1 at most.
+    pub odometry_restarts: u64,
     /// Scans that went without odometry; only engines that can do without have such.
     pub scans_without_odometry: u64,
     /// Processed scans that left a direction open, where the engine looks for it.
@@ -323,6 +325,7 @@ fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
         effective_sample_size: report.map(|report| report.effective_sample_size),
         resamples: snapshot.resamples,
         odometry_jumps: gauges.odometry_jumps,
+        odometry_restarts: gauges.odometry_restarts,
         scans_without_odometry: gauges.without_odometry,
         weak_directions: gauges.weak,
         weak_direction: report.and_then(|report| report.weak_direction),

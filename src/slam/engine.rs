@@ -192,6 +192,16 @@ impl Engine {
         }
     }
 
+    /// Forgets where odometry has the base: the next reading begins anew, and is no motion. Where
+    /// poses are given, this has no effect.
+    pub const fn forget_odometry(&mut self) {
+        match self {
+            Self::GMapping(filter) => filter.forget_odometry(),
+            Self::Hector(hector) => hector.forget_odometry(),
+            Self::KnownPoses(_) => {}
+        }
+    }
+
     /// Takes an odometry reading: the base in `odom`.
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         match self {

@@ -114,15 +114,20 @@ impl Mapper {
     }
 
     /// Takes the robot to be where the configuration says, if it does, and not where the state has
-    /// it; or searches for its place in the map.
+    /// it; or searches for its place in the map. Odometry begins anew where it was carried to, and
+    /// until then no pose is told.
     pub fn take_configured_pose(&mut self) {
-        match self.initial_pose {
-            None => {}
-            Some(InitialPose::At([x, y, yaw])) => {
+        let Some(initial_pose) = self.initial_pose else { return };
+        self.engine.forget_odometry();
+        self.synchronizer.forget_odometry();
+        self.view.odom_from_base = None;
+        self.view.estimate.stamp = None;
+        match initial_pose {
+            InitialPose::At([x, y, yaw]) => {
                 let (done, _) = self.set_pose(Pose2::new(x, y, yaw));
                 tracing::info!("initial_pose is another than before: {done}");
             }
-            Some(InitialPose::Search(_)) => {
+            InitialPose::Search(_) => {
                 tracing::info!("the robot's place in the map is searched for");
                 self.search_pose();
             }

@@ -240,6 +240,11 @@ impl GMapping {
         self.searched.is_some()
     }
 
+    /// Forgets where odometry has the base: the next reading begins anew, and is no motion.
+    pub const fn forget_odometry(&mut self) {
+        self.odometry.odom_from_base = None;
+    }
+
     /// Takes an odometry reading: the base in `odom`.
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         if !self.parameters.jump.is_usable(odom_from_base) {
