@@ -484,7 +484,15 @@ async fn what_cannot_be_written_is_told_and_mapping_goes_on() {
     let error = robot.ask("slam/cmd/checkpoint").await.unwrap_err();
     assert!(error.starts_with("the state is not written"), "{error}");
     daemon.terminate(&robot).await;
+    let often = ["--set", "checkpoint={every_s: 0.2, every_scans: 1}"];
+    let daemon = Daemon::start(&mesh, &robot, &often).await;
+    robot.feed(&moments[20]).await;
+    robot.until_checkpoint(|status| status["error"] != Value::Null).await;
+    // Once it can be written, it is, though no scan comes.
     fs::remove_file(mesh.state("robot01")).unwrap();
+    robot.until_checkpoint(|status| status["written"] == 1).await;
+    daemon.terminate(&robot).await;
+    fs::remove_dir_all(mesh.state("robot01")).unwrap();
 
     // Files may have 16 KiB, as on a disk that is nearly full: the first states fit.
     let mut limited = Command::new("sh");
@@ -526,6 +534,10 @@ async fn a_checkpoint_can_be_asked_for_and_holds_what_was_commanded() {
     // What a command changed is written at once.
     robot.ask("slam/cmd/pause").await.unwrap();
     robot.until_checkpoint(|status| status["written"] == 2).await;
+    // Nothing was changed, and so nothing is written.
+    robot.ask("slam/cmd/pause").await.unwrap();
+    let done = String::from_utf8(robot.ask("slam/cmd/checkpoint").await.unwrap()).unwrap();
+    assert!(done.contains("checkpoint-0000000003.state"), "{done}");
     let two = Command::new(env!("CARGO_BIN_EXE_gmapd"))
         .args(["run", "--zenoh"])
         .arg(&mesh.configuration)
@@ -756,4 +768,37 @@ fn end_of(path: &[u8]) -> Pose2 {
     let last = std::str::from_utf8(path).unwrap().lines().last().unwrap();
     let numbers: Vec<f64> = last.split(' ').map(|word| word.parse().unwrap()).collect();
     Pose2::new(numbers[1], numbers[2], 0.0)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn however_many_ask_a_slow_disk_for_a_checkpoint_one_is_written() {
+    const ASKERS: usize = 4;
+    let mesh = Mesh::new().await;
+    let moments = drive(5);
+    let robot = mesh.robot("robot01").await;
+    let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
+    // Opening a pipe to write waits for somebody who reads, as a disk that does not answer.
+    let name = format!(".checkpoint-0000000001.state.{}.tmp", daemon.0.id());
+    let pipe = mesh.state("robot01").join(name);
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    robot.feed_all(&moments).await;
+    let mut replies = Vec::new();
+    for _ in 0..ASKERS {
+        replies.push(robot.session.get("robot01/slam/cmd/checkpoint").await.unwrap());
+    }
+    // Commands are done in the order in which they come, and this one after those.
+    robot.ask("slam/cmd/pause").await.unwrap();
+    let status = robot.status().await["checkpoint"].take();
+    assert_eq!((&status["written"], &status["error"]), (&Value::from(0), &Value::Null));
+
+    drop(fs::File::open(&pipe).unwrap());
+    for reply in replies {
+        let reply = tokio::time::timeout(PATIENCE, reply.recv_async()).await.unwrap().unwrap();
+        let done = reply.result().unwrap().payload().try_to_string().unwrap().into_owned();
+        assert!(done.contains("the state is in"), "{done}");
+    }
+    // A command that overtook another one costs one more.
+    let written = robot.status().await["checkpoint"]["written"].as_u64().unwrap();
+    assert!(written < ASKERS as u64, "{written}");
+    daemon.kill(&robot).await;
 }

@@ -291,15 +291,14 @@ impl Mapper {
     fn checkpoint_if_due(&mut self) {
         let scans = self.scans();
         if self.keeper.as_ref().is_some_and(|keeper| keeper.is_due(clock::now(), scans)) {
-            self.checkpoint(None);
+            self.checkpoint();
         }
     }
 
-    /// Has the state written; without a keeper, whoever waits for it hears nothing.
-    fn checkpoint(&mut self, done: Option<oneshot::Sender<Done>>) {
+    fn checkpoint(&mut self) {
         let (engine, state) = (self.engine.clone(), self.state());
         if let Some(keeper) = &mut self.keeper {
-            keeper.write(engine, state, done);
+            keeper.write(engine, state);
         }
     }
 
@@ -510,10 +509,10 @@ impl Mapper {
 
     /// Whoever gets the answer finds it in the snapshot, too.
     fn obey(&mut self, request: Request) {
+        if let (Command::Checkpoint, Some(keeper)) = (request.command, &mut self.keeper) {
+            return keeper.ask(request.reply);
+        }
         let (done, changed) = match request.command {
-            Command::Checkpoint if self.keeper.is_some() => {
-                return self.checkpoint(Some(request.reply));
-            }
             Command::Checkpoint => {
                 ("the state is not kept: neither --state nor state_directory is set".into(), false)
             }
@@ -526,7 +525,7 @@ impl Mapper {
         tracing::info!(command = ?request.command, done, "command");
         self.view.changed = true;
         self.publish();
-        if let Some(keeper) = &mut self.keeper {
+        if let Some(keeper) = self.keeper.as_mut().filter(|_| changed) {
             keeper.note_command();
         }
         // Whoever asked may be gone.
@@ -626,9 +625,10 @@ impl Mapper {
 
     /// Scans that wait for their odometry are in the state, and wait on after the restart.
     fn checkpoint_last(&mut self) {
-        if self.keeper.is_some() {
+        if let Some(keeper) = &mut self.keeper {
             let (done, written) = oneshot::channel();
-            self.checkpoint(Some(done));
+            keeper.ask(done);
+            self.checkpoint();
             // The thread tells of what goes wrong.
             written.blocking_recv().ok();
         }
