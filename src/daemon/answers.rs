@@ -13,6 +13,7 @@ use zenoh::bytes::Encoding;
 
 use super::command::{Command, Done, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
+use super::limits::Reason;
 use super::save::{SaveError, SaveName, Saver};
 use super::selector::{
     MapFormat, MessageFormat, PathFormat, Question, RegionForm, RegionQuestion, SelectorError,
@@ -80,6 +81,20 @@ pub(super) enum Refusal {
     NoReply(Duration),
     #[error("the daemon is stopping; the command was not done")]
     Stopping,
+}
+
+impl Refusal {
+    /// The limit that it is beyond, if it is.
+    pub(super) const fn reason(&self) -> Option<Reason> {
+        match self {
+            Self::Wildcard(_) => Some(Reason::Wildcard),
+            Self::SwitchedOff(_) => Some(Reason::SwitchedOff),
+            Self::TooManyCommands(_) | Self::CommandsWaiting => Some(Reason::TooManyCommands),
+            Self::TooMany(_) => Some(Reason::TooManyQueries),
+            Self::TooLarge { .. } => Some(Reason::TooLarge),
+            _ => None,
+        }
+    }
 }
 
 /// As `at=` takes them.

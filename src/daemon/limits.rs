@@ -1,7 +1,11 @@
 //! What the mesh may ask of the daemon at most.
 
+use std::collections::BTreeMap;
+use std::fmt;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
+
+use serde::Serialize;
 
 use crate::config::{CommandName, Config};
 
@@ -35,6 +39,77 @@ impl Limits {
     }
 }
 
+/// Why something that was asked for is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Reason {
+    /// A command by a wildcard.
+    Wildcard,
+    /// A command that is switched off.
+    SwitchedOff,
+    /// More commands than are done in a second, or than may wait.
+    TooManyCommands,
+    /// More queries than are answered at once.
+    TooManyQueries,
+    /// An answer of more bytes than one may have.
+    TooLarge,
+}
+
+impl Reason {
+    /// All of them.
+    pub const ALL: [Self; 5] = [
+        Self::Wildcard,
+        Self::SwitchedOff,
+        Self::TooManyCommands,
+        Self::TooManyQueries,
+        Self::TooLarge,
+    ];
+}
+
+/// What was refused: counted for the status, and told in the log, of each reason once a second.
+#[derive(Debug, Default)]
+pub struct Refusals(Mutex<BTreeMap<Reason, Tally>>);
+
+#[derive(Debug, Default)]
+struct Tally {
+    count: u64,
+    /// Since the last that was told.
+    untold: u64,
+    told: Option<Instant>,
+}
+
+impl Refusals {
+    /// How many were refused for each reason.
+    #[must_use]
+    pub fn counts(&self) -> BTreeMap<Reason, u64> {
+        let tallies = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let count = |reason| tallies.get(&reason).map_or(0, |tally| tally.count);
+        Reason::ALL.into_iter().map(|reason| (reason, count(reason))).collect()
+    }
+
+    /// Counts one more, and tells it unless another one was told in the second before.
+    pub(super) fn note(&self, reason: Reason, refusal: &dyn fmt::Display, now: Instant) {
+        match self.count(reason, now) {
+            None => {}
+            Some(0) => tracing::warn!("refused a query: {refusal}"),
+            Some(more) => tracing::warn!("refused a query, and {more} such before: {refusal}"),
+        }
+    }
+
+    /// Counts one more; if it is to be told, how many were not since the last.
+    fn count(&self, reason: Reason, now: Instant) -> Option<u64> {
+        let mut tallies = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let tally = tallies.entry(reason).or_default();
+        tally.count += 1;
+        if tally.told.is_some_and(|told| now.saturating_duration_since(told) < SECOND) {
+            tally.untold += 1;
+            return None;
+        }
+        tally.told = Some(now);
+        Some(std::mem::take(&mut tally.untold))
+    }
+}
+
 /// Counts what is let through in a second, which begins with the first.
 #[derive(Debug)]
 pub(super) struct Rate {
@@ -62,6 +137,20 @@ impl Rate {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn of_what_is_refused_all_is_counted_and_one_a_second_is_told() {
+        let refusals = Refusals::default();
+        let began = crate::clock::now();
+        let told = |reason, milliseconds| {
+            refusals.count(reason, began + Duration::from_millis(milliseconds))
+        };
+        let wildcards = [0, 10, 999, 1000, 1500, 2000].map(|at| told(Reason::Wildcard, at));
+        assert_eq!(wildcards, [Some(0), None, None, Some(2), None, Some(1)]);
+        assert_eq!(told(Reason::TooLarge, 20), Some(0), "each reason for itself");
+        let counts: Vec<u64> = refusals.counts().into_values().collect();
+        assert_eq!(counts, [6, 0, 0, 0, 1]);
+    }
 
     #[test]
     fn so_many_are_let_through_in_a_second() {

@@ -13,7 +13,7 @@ use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait as _};
 
 use super::answers::{Answer, Refusal, Responder};
-use super::limits::{Limits, Rate};
+use super::limits::{Limits, Rate, Reason, Refusals};
 use super::ros_node::RosNode;
 use super::selector::Topic;
 use super::serving::ServingError;
@@ -52,7 +52,7 @@ pub(super) struct Queryables {
     declared: Vec<Queryable<()>>,
     counter: Counter,
     queries_at_once: u32,
-    refusals: JoinHandle<()>,
+    refusing: JoinHandle<()>,
 }
 
 /// Where queries are taken in.
@@ -68,6 +68,7 @@ struct Counter {
     refused: mpsc::Sender<Query>,
     limits: Arc<Limits>,
     rate: Arc<Rate>,
+    refusals: Arc<Refusals>,
     runtime: Handle,
 }
 
@@ -78,6 +79,7 @@ impl Queryables {
         node: &mut RosNode,
         responder: Arc<Responder>,
         limits: Limits,
+        refusals: Arc<Refusals>,
     ) -> Result<Self, ServingError> {
         let (refused, waiting) = mpsc::channel(REFUSALS_WAITING);
         let queries_at_once = limits.queries_at_once;
@@ -87,6 +89,7 @@ impl Queryables {
             turns: Arc::new(Semaphore::new(TURNS)),
             commands: Arc::new(Semaphore::new(COMMANDS_AT_ONCE)),
             refused,
+            refusals,
             rate: Arc::new(Rate::new(limits.commands_per_second)),
             limits: Arc::new(limits),
             runtime: Handle::current(),
@@ -100,13 +103,13 @@ impl Queryables {
         if let Some(key) = node.service(topic.name(), GET_MAP)? {
             declared.push(counter.declare(session, topic, key, Asker::RosNode).await?);
         }
-        let refusals = tokio::spawn(refuse_all(waiting, queries_at_once));
-        Ok(Self { declared, counter, queries_at_once: queries_at_once as u32, refusals })
+        let refusing = tokio::spawn(refuse_all(waiting, queries_at_once));
+        Ok(Self { declared, counter, queries_at_once: queries_at_once as u32, refusing })
     }
 
     /// Takes no more queries, and waits until those that came are answered.
     pub(super) async fn stop(self) {
-        let Self { declared, counter, queries_at_once, refusals } = self;
+        let Self { declared, counter, queries_at_once, refusing } = self;
         // It blocks while the network is slow.
         let undeclare = move || {
             for queryable in declared {
@@ -118,7 +121,7 @@ impl Queryables {
         spawn_blocking(undeclare).await.ok();
         counter.answers.acquire_many(queries_at_once).await.ok();
         counter.commands.acquire_many(COMMANDS_AT_ONCE as u32).await.ok();
-        refusals.abort();
+        refusing.abort();
     }
 }
 
@@ -146,6 +149,11 @@ impl Counter {
         }
         let places = if topic.command().is_some() { &self.commands } else { &self.answers };
         let Ok(place) = places.clone().try_acquire_owned() else {
+            let reason = match topic.command() {
+                Some(_) => Reason::TooManyCommands,
+                None => Reason::TooManyQueries,
+            };
+            self.refusals.note(reason, &"too many come at once", clock::now());
             let may_wait = query.parameters().as_str().len() <= LONGEST_WAITING;
             if !may_wait || self.refused.try_send(query).is_err() {
                 tracing::debug!(%key, "a query ends without a reply: too many come at once");
@@ -155,6 +163,11 @@ impl Counter {
         let counter = self.clone();
         let answering = move || {
             let answer = counter.answer(topic, &query);
+            if let Err(refusal) = &answer
+                && let Some(reason) = refusal.reason()
+            {
+                counter.refusals.note(reason, refusal, clock::now());
+            }
             let answer = answer.map(|answer| asker.sign(answer, &query));
             reply(&query, &key, answer);
             // Whoever asked is told that nothing more comes before the place is free again.
@@ -175,7 +188,6 @@ impl Counter {
                 return Err(Refusal::Wildcard(topic.name()));
             }
             if !limits.commands.contains(&command) {
-                tracing::warn!(command = topic.name(), "refused a command that is switched off");
                 return Err(Refusal::SwitchedOff(topic.name()));
             }
         }
