@@ -217,6 +217,7 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("queries_at_once", raw.queries_at_once as f64, Between(1.0, 1000.0)),
         ("max_message_bytes", raw.max_message_bytes as f64, Between(1024.0, MOST_BYTES)),
         ("max_reply_bytes", raw.max_reply_bytes as f64, Between(65536.0, MOST_BYTES)),
+        ("max_bytes_in_flight", raw.max_bytes_in_flight as f64, Between(65536.0, MOST_BYTES)),
         ("checkpoint", raw.checkpoint.every_s, Between(0.1, 86_400.0)),
         ("checkpoint", raw.checkpoint.every_scans as f64, AtLeast(1.0)),
         ("checkpoint", raw.checkpoint.keep as f64, Between(1.0, 1000.0)),

@@ -22,6 +22,7 @@ use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
 use super::tiles::{TileSet, TileStore};
 use crate::convert;
+use crate::map::region::RegionError;
 use crate::ros;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
@@ -73,6 +74,11 @@ pub(super) enum Refusal {
          bbox=, or for larger cells with res="
     )]
     TooLarge { bytes: usize, most: usize },
+    #[error(
+        "answers of {bytes} bytes are on their way already, and max_bytes_in_flight allows {most} \
+         with this one; ask again"
+    )]
+    TooManyBytes { bytes: usize, most: usize },
     #[error("{0} queries are being answered already; ask again")]
     TooMany(usize),
     #[error("too many commands are waiting already; ask again")]
@@ -91,7 +97,11 @@ impl Refusal {
             Self::SwitchedOff(_) => Some(Reason::SwitchedOff),
             Self::TooManyCommands(_) | Self::CommandsWaiting => Some(Reason::TooManyCommands),
             Self::TooMany(_) => Some(Reason::TooManyQueries),
-            Self::TooLarge { .. } => Some(Reason::TooLarge),
+            Self::TooLarge { .. }
+            | Self::Format(FormatError::Region(
+                RegionError::TooMuch { .. } | RegionError::TooLong(_),
+            )) => Some(Reason::TooLarge),
+            Self::TooManyBytes { .. } => Some(Reason::TooManyBytes),
             _ => None,
         }
     }
@@ -114,6 +124,7 @@ pub(super) struct Responder {
     tiles: Arc<TileStore>,
     saver: Saver,
     map_frame: String,
+    max_reply_bytes: usize,
 }
 
 impl Responder {
@@ -134,6 +145,7 @@ impl Responder {
             products: Arc::new(ProductCache::new(empty)),
             saver: Saver::new(settings.save_directory.clone()),
             map_frame: settings.map_frame.clone(),
+            max_reply_bytes: settings.limits.max_reply_bytes,
         }
     }
 
@@ -211,10 +223,11 @@ impl Responder {
         let products = self.products_of(snapshot);
         let (payload, encoding) = match &question.form {
             RegionForm::Layers(layers) => {
-                (products.layers(question, layers)?, Encoding::APPLICATION_JSON)
+                let text = products.layers(question, layers, self.max_reply_bytes)?;
+                (text, Encoding::APPLICATION_JSON)
             }
             RegionForm::Map(format) => {
-                let region = products.region(question)?;
+                let region = products.region(question, self.max_reply_bytes)?;
                 let robot_in_map = snapshot.estimate.pose_in_map;
                 (region.map(*format, robot_in_map)?, map_encoding(*format))
             }

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -23,6 +24,8 @@ pub struct Limits {
     pub queries_at_once: usize,
     /// Bytes of an answer.
     pub max_reply_bytes: usize,
+    /// Bytes of answers that are on their way together. One alone is let through in any case.
+    pub max_bytes_in_flight: usize,
 }
 
 impl Limits {
@@ -35,6 +38,7 @@ impl Limits {
             commands_per_second: raw.commands_per_second,
             queries_at_once: raw.queries_at_once,
             max_reply_bytes: raw.max_reply_bytes,
+            max_bytes_in_flight: raw.max_bytes_in_flight,
         }
     }
 }
@@ -53,16 +57,19 @@ pub enum Reason {
     TooManyQueries,
     /// An answer of more bytes than one may have.
     TooLarge,
+    /// An answer with which more bytes would be on their way than may be.
+    TooManyBytes,
 }
 
 impl Reason {
     /// All of them.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 6] = [
         Self::Wildcard,
         Self::SwitchedOff,
         Self::TooManyCommands,
         Self::TooManyQueries,
         Self::TooLarge,
+        Self::TooManyBytes,
     ];
 }
 
@@ -134,9 +141,61 @@ impl Rate {
     }
 }
 
+/// Bytes of answers that are on their way: those to clients that read slowly stay in memory.
+#[derive(Debug)]
+pub(super) struct InFlight {
+    most: usize,
+    bytes: AtomicUsize,
+}
+
+/// Room for an answer on its way, until it is dropped.
+#[derive(Debug)]
+pub(super) struct Room {
+    bytes: usize,
+    of: Arc<InFlight>,
+}
+
+impl InFlight {
+    pub(super) fn new(most: usize) -> Arc<Self> {
+        Arc::new(Self { most, bytes: AtomicUsize::new(0) })
+    }
+
+    /// Room for an answer of so many bytes.
+    ///
+    /// # Errors
+    /// When there is none, with the bytes that are on their way; an answer alone always has room.
+    pub(super) fn room(self: &Arc<Self>, bytes: usize) -> Result<Room, usize> {
+        let more = |before: usize| {
+            let after = before.saturating_add(bytes);
+            (before == 0 || after <= self.most).then_some(after)
+        };
+        self.bytes.fetch_update(Ordering::AcqRel, Ordering::Acquire, more)?;
+        Ok(Room { bytes, of: Arc::clone(self) })
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.of.bytes.fetch_sub(self.bytes, Ordering::AcqRel);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn answers_on_their_way_have_so_many_bytes_together_and_one_alone_any() {
+        let in_flight = InFlight::new(100);
+        let alone = in_flight.room(500).unwrap();
+        assert_eq!(in_flight.room(1).unwrap_err(), 500);
+        drop(alone);
+        let [first, second] = [60, 40].map(|bytes| in_flight.room(bytes).unwrap());
+        assert_eq!(in_flight.room(1).unwrap_err(), 100);
+        drop(first);
+        assert!(in_flight.room(60).is_ok());
+        drop(second);
+    }
 
     #[test]
     fn of_what_is_refused_all_is_counted_and_one_a_second_is_told() {
@@ -149,7 +208,7 @@ mod tests {
         assert_eq!(wildcards, [Some(0), None, None, Some(2), None, Some(1)]);
         assert_eq!(told(Reason::TooLarge, 20), Some(0), "each reason for itself");
         let counts: Vec<u64> = refusals.counts().into_values().collect();
-        assert_eq!(counts, [6, 0, 0, 0, 1]);
+        assert_eq!(counts, [6, 0, 0, 0, 1, 0]);
     }
 
     #[test]
