@@ -53,6 +53,9 @@ pub struct Head {
     pub stamp: Option<Stamp>,
     /// The map that would be handed out; `None` before the first scan.
     pub map: Option<MapSize>,
+    /// Whether the robot's place in it is searched for.
+    #[serde(default)]
+    pub searching: bool,
     /// Of the body before it is compressed.
     pub body_bytes: u64,
 }
@@ -76,7 +79,13 @@ impl Head {
         Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Looks whether who has `own` can go on from this; in another mode it can.
+    /// Whether `own` has another initial pose: the robot was carried, and is there now.
+    #[must_use]
+    pub fn has_other_pose(&self, own: &Self) -> bool {
+        self.settings.get(INITIAL_POSE) != own.settings.get(INITIAL_POSE)
+    }
+
+    /// Looks whether who has `own` can go on from this; in another mode and at another pose it can.
     ///
     /// # Errors
     /// When it is of another robot, another engine or another configuration.
@@ -92,7 +101,7 @@ impl Head {
         let told = |value: Option<&Value>| value.map_or("not set".to_owned(), Value::to_string);
         let keys = self.settings.keys().chain(own.settings.keys());
         match keys
-            .filter(|key| *key != MODE)
+            .filter(|key| ![MODE, INITIAL_POSE].contains(&key.as_str()))
             .find(|key| self.settings.get(*key) != own.settings.get(*key))
         {
             None => Ok(()),
@@ -107,6 +116,9 @@ impl Head {
 
 /// The key of the configuration that changes during a run, too.
 pub const MODE: &str = "mode";
+
+/// The key of the configuration that says where the robot is.
+const INITIAL_POSE: &str = "initial_pose";
 
 /// Why a checkpoint is not taken.
 #[derive(Debug, Error)]
@@ -274,6 +286,7 @@ mod tests {
             particles: 30,
             stamp: Some(Stamp(12_000_000_001)),
             map: Some(MapSize { width: 3, height: 4, resolution: 0.05 }),
+            searching: false,
             body_bytes: 0,
         }
     }

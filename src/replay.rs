@@ -15,7 +15,7 @@ pub use summary::{
 };
 
 use crate::clock::{Elapsed, Stopwatch};
-use crate::config::{Config, OdometrySource};
+use crate::config::{Config, InitialPose, OdometrySource};
 use crate::convert;
 use crate::evaluation::StampedPose;
 use crate::logs::Reading;
@@ -49,8 +49,13 @@ impl Replay {
     /// # Errors
     /// When the map to start from cannot be used, or the threads cannot be started.
     pub fn new(config: &Config, threads: usize) -> Result<Self, StartError> {
-        if config.raw.mode == Mode::Localization && config.raw.map.is_none() {
-            return Err(StartError::NoMap);
+        let searches = matches!(config.raw.initial_pose, Some(InitialPose::Search(_)));
+        match config.raw.map {
+            None if config.raw.mode == Mode::Localization => {
+                return Err(StartError::NoMap("mode is localization"));
+            }
+            None if searches => return Err(StartError::NoMap("initial_pose is search")),
+            _ => {}
         }
         Ok(Self {
             engine: starting::engine(config, threads)?,

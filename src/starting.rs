@@ -26,9 +26,9 @@ pub enum StartError {
         /// Why.
         source: MapFileError,
     },
-    /// There is no map to localize in.
-    #[error("mode is localization: a map is needed: --map, or map")]
-    NoMap,
+    /// There is no map to localize in, or to search.
+    #[error("{0}: a map is needed: --map, or map")]
+    NoMap(&'static str),
     /// The map has other cells than the engine.
     #[error(
         "map: {}: resolution is {found} m a cell, and {key} is {wanted} m; set {key} to {found}",

@@ -146,6 +146,12 @@ impl<T: Interpolate> Timeline<T> {
         }
     }
 
+    /// Forgets all samples: what comes next has nothing to do with them.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+        self.suspect = None;
+    }
+
     /// Whether it is such as inserting makes it; of one that was read, nobody knows.
     #[must_use]
     pub fn is_sound(&self) -> bool {

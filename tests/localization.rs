@@ -325,6 +325,45 @@ fn after_a_refusal_the_next_scan_tries_again_and_a_pose_ends_the_search() {
     }
 }
 
+#[test]
+fn a_robot_whose_place_is_searched_for_goes_on_in_the_map_so_far() {
+    for name in ENGINES {
+        let lidar = lidar();
+        let mut engine = starting::engine(&config(&[name]), 1).expect("it needs no map");
+        for shot in shots(&room(CORNER), &lidar, &route(CORNER)) {
+            add(&mut engine, &lidar, &shot);
+        }
+        let (before, map) = (engine.path().len(), engine.occupancy_grid());
+        engine.search_pose();
+        assert!(engine.is_searching() && engine.has_begun(), "{name}");
+
+        let (drive, truth) = second_drive();
+        let nowhere = vec![Segment::new(Point2::new(-9.0, 2.0), Point2::new(9.0, 4.0))];
+        let wrong = shots(&World::new(nowhere, Vec::new()), &lidar, &truth[..1]).remove(0);
+        for _ in 0..2 {
+            let wrong = Shot { odom_from_base: drive[0].odom_from_base, ..wrong.clone() };
+            let update = add(&mut engine, &lidar, &wrong);
+            assert_eq!(update, ScanUpdate::Skipped(SkipReason::NotLocalized), "{name}");
+            assert!(engine.obstacle().is_some() && engine.occupancy_grid() == map, "{name}");
+        }
+        for (index, (shot, truth)) in drive.iter().zip(&truth).enumerate() {
+            let update = add(&mut engine, &lidar, shot);
+            assert!(matches!(update, ScanUpdate::Processed(_)), "{name} {index}: {update:?}");
+            let (metres, radians) = apart(engine.pose_in_map(), *truth);
+            assert!(metres < 0.1 && radians < 0.05, "{name} {index}: {metres} m, {radians} rad");
+        }
+        assert!(!engine.is_searching() && engine.obstacle().is_none(), "{name}");
+        assert_eq!(engine.path().len(), before + drive.len(), "{name}");
+
+        engine.search_pose();
+        engine.set_pose(truth[0]);
+        assert!(!engine.is_searching(), "{name}: a pose ends the search");
+        engine.search_pose();
+        engine.reset(None);
+        assert!(!engine.is_searching(), "{name}: so does a reset");
+    }
+}
+
 fn gmapd(arguments: &[&str]) -> Output {
     let program = Command::new(env!("CARGO_BIN_EXE_gmapd")).args(arguments).output();
     program.expect("the program runs")

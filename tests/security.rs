@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use gmapd::config::Config;
 use gmapd::daemon::keys::Prefix;
+use gmapd::daemon::limits::Reason;
 use gmapd::daemon::snapshot::State;
 use gmapd::daemon::{Daemon, Settings};
 use tokio::sync::watch;
@@ -132,6 +133,9 @@ impl Mesh {
         assert!(ask(&reader, "robot01/slam/cmd/pause").await.is_empty());
         let wildcard = ask_until_answered(&reader, "robot01/slam/*/pause").await;
         assert!(wildcard[0].contains("wildcard"), "{wildcard:?}");
+        self.log.says(&["WARN gmapd::daemon::limits", "refused a query", "by a wildcard"]).await;
+        assert!(daemon.status().refused[&Reason::Wildcard] >= 1);
+        assert_eq!(daemon.status().refused[&Reason::SwitchedOff], 0);
         assert_eq!(daemon.status().state, State::WaitingForScans);
         self.log.says(&["(reader)", "unauthorized to Query (ingress) on robot01/slam/cmd"]).await;
 

@@ -12,6 +12,7 @@ use gmapd::convert::{self, OdometrySample};
 use gmapd::daemon::checkpointing::Checkpoint;
 use gmapd::ros;
 use gmapd::sim::{self, Place, Scenario, Simulation};
+use gmapd::slam::pose::{Pose2, Stamp};
 use gmapd::slam::scan::LaserMount;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -32,21 +33,30 @@ struct Moment {
     odometry: Vec<u8>,
     scan: Vec<u8>,
     stamp: i64,
+    odom_from_base: Pose2,
 }
 
 /// The first moments of a drive through a building.
 fn drive(moments: usize) -> Vec<Moment> {
+    drive_after(moments, 0, Pose2::IDENTITY)
+}
+
+/// The same drive so many seconds later, with an odometry that has its origin elsewhere.
+fn drive_after(moments: usize, seconds: i64, odom_from_before: Pose2) -> Vec<Moment> {
     let scenario = Scenario { beams: 60, ..Scenario::new(Place::Building, 3) };
     let mut simulation = Simulation::new(&scenario).unwrap();
     simulation.lidar.mount = LaserMount::default();
-    let moment = |reading: sim::Reading| {
+    let moment = |mut reading: sim::Reading| {
+        let stamp = Stamp(reading.stamp.0 + seconds * 1_000_000_000);
+        (reading.stamp, reading.scan.stamp) = (stamp, stamp);
         let odometry = OdometrySample {
             stamp: reading.stamp,
             odom_frame: "odom".to_owned(),
             base_frame: "base_link".to_owned(),
-            odom_from_base: reading.odom_from_base,
+            odom_from_base: odom_from_before * reading.odom_from_base,
         };
         Moment {
+            odom_from_base: odometry.odom_from_base,
             odometry: ros::cdr(&convert::odometry_message(&odometry)),
             scan: ros::cdr(&convert::laser_scan(&reading.scan, "base_link")),
             stamp: reading.stamp.0,
@@ -185,6 +195,13 @@ impl Robot {
             assert!(start.elapsed() < PATIENCE, "{status}");
             tokio::task::yield_now().await;
         }
+    }
+
+    /// Where the robot is.
+    async fn pose(&self) -> Pose2 {
+        let pose = &self.status().await["pose_in_map"];
+        let [x, y, theta] = ["x", "y", "theta"].map(|axis| pose[axis].as_f64().unwrap());
+        Pose2::new(x, y, theta)
     }
 
     /// The map's picture and the path.
@@ -467,7 +484,15 @@ async fn what_cannot_be_written_is_told_and_mapping_goes_on() {
     let error = robot.ask("slam/cmd/checkpoint").await.unwrap_err();
     assert!(error.starts_with("the state is not written"), "{error}");
     daemon.terminate(&robot).await;
+    let often = ["--set", "checkpoint={every_s: 0.2, every_scans: 1}"];
+    let daemon = Daemon::start(&mesh, &robot, &often).await;
+    robot.feed(&moments[20]).await;
+    robot.until_checkpoint(|status| status["error"] != Value::Null).await;
+    // Once it can be written, it is, though no scan comes.
     fs::remove_file(mesh.state("robot01")).unwrap();
+    robot.until_checkpoint(|status| status["written"] == 1).await;
+    daemon.terminate(&robot).await;
+    fs::remove_dir_all(mesh.state("robot01")).unwrap();
 
     // Files may have 16 KiB, as on a disk that is nearly full: the first states fit.
     let mut limited = Command::new("sh");
@@ -509,6 +534,10 @@ async fn a_checkpoint_can_be_asked_for_and_holds_what_was_commanded() {
     // What a command changed is written at once.
     robot.ask("slam/cmd/pause").await.unwrap();
     robot.until_checkpoint(|status| status["written"] == 2).await;
+    // Nothing was changed, and so nothing is written.
+    robot.ask("slam/cmd/pause").await.unwrap();
+    let done = String::from_utf8(robot.ask("slam/cmd/checkpoint").await.unwrap()).unwrap();
+    assert!(done.contains("checkpoint-0000000003.state"), "{done}");
     let two = Command::new(env!("CARGO_BIN_EXE_gmapd"))
         .args(["run", "--zenoh"])
         .arg(&mesh.configuration)
@@ -538,17 +567,8 @@ async fn a_map_goes_on_in_the_mode_that_was_configured_or_commanded_last() {
 
     let localizing = ["--set", "mode=localization", "--set", "commands_per_second=3"];
     let empty = tempfile::tempdir().unwrap();
-    let refused = Command::new(env!("CARGO_BIN_EXE_gmapd"))
-        .args(["run", "--zenoh"])
-        .arg(&mesh.configuration)
-        .arg("--state")
-        .arg(empty.path())
-        .args(localizing)
-        .output()
-        .unwrap();
-    assert_eq!(refused.status.code(), Some(1));
-    let error = String::from_utf8(refused.stderr).unwrap();
-    assert!(error.contains("has no state of this robot to go on from"), "{error}");
+    let error = complaint(&mesh, empty.path(), &localizing);
+    assert!(error.contains("has no state of this robot with a map to go on from"), "{error}");
     let daemon = Daemon::start(&mesh, &robot, &localizing).await;
     let status = robot.status().await;
     assert_eq!(status["mode"], "localization");
@@ -569,4 +589,216 @@ async fn a_map_goes_on_in_the_mode_that_was_configured_or_commanded_last() {
     let daemon = Daemon::start(&mesh, &robot, &localizing).await;
     assert_eq!(robot.status().await["mode"], "localization");
     daemon.terminate(&robot).await;
+}
+
+/// Metres between two poses.
+fn apart(a: Pose2, b: Pose2) -> f64 {
+    (a.x - b.x).hypot(a.y - b.y)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_was_carried_is_where_it_is_said_to_be() {
+    let mesh = Mesh::new().await;
+    let moments = drive(80);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.feed_all(&moments[..20]).await;
+        let Pose2 { x, y, theta } = robot.pose().await;
+        robot.feed_all(&moments[20..60]).await;
+        let there = robot.pose().await;
+        robot.feed_all(&moments[60..]).await;
+        daemon.terminate(&robot).await;
+
+        // As an operator points at where it was after 20 moments; odometry has another origin.
+        let given = format!("{},{},{theta}", x + 0.1, y - 0.1);
+        let said = [engine, &["--initial-pose", given.as_str()][..]].concat();
+        let again = drive_after(60, 1000, odometry_elsewhere(&moments));
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        assert_ne!(robot.status().await["checkpoint"]["resumed_from"], Value::Null);
+        assert!(apart(robot.pose().await, Pose2::new(x + 0.1, y - 0.1, theta)) < 1e-6);
+        robot.until_checkpoint(|status| status["written"] == 1).await;
+        daemon.kill(&robot).await;
+
+        // A pose that is said already says nothing new, in which checkpoint it may be.
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        robot.feed_all(&again[20..]).await;
+        let pose = robot.pose().await;
+        assert!(apart(pose, there) < 0.25, "{engine:?}: {pose:?}, and not {there:?}");
+        daemon.terminate(&robot).await;
+        let daemon = Daemon::start(&mesh, &robot, &said).await;
+        assert!(apart(robot.pose().await, pose) < 1e-6);
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_place_of_a_robot_that_was_carried_is_searched_for_in_its_map() {
+    let mesh = Mesh::new().await;
+    let moments = drive(80);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let search = [engine, &["--initial-pose", "search"][..]].concat();
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.feed_all(&moments[..40]).await;
+        let there = robot.pose().await;
+        robot.feed_all(&moments[40..]).await;
+        let area = robot.status().await["map"]["known_area_m2"].clone();
+        daemon.terminate(&robot).await;
+
+        let daemon = Daemon::start(&mesh, &robot, &search).await;
+        let error = robot.ask("pose").await.unwrap_err();
+        assert!(error.starts_with("the pose is not known yet"), "{error}");
+        robot.until_checkpoint(|status| status["written"] == 1).await;
+        daemon.kill(&robot).await;
+
+        // Until its place is found, each restart goes on searching.
+        let again = drive_after(41, 1000, odometry_elsewhere(&moments));
+        let blind = Moment { scan: no_walls(&again[20]), ..again[20].clone() };
+        let daemon = Daemon::start(&mesh, &robot, &search).await;
+        assert!(robot.ask("pose").await.is_err());
+        assert_eq!(robot.feed(&blind).await.unwrap(), "not_localized");
+        let status = robot.status().await;
+        assert_eq!(status["state"], "not_localized", "{status}");
+        assert_eq!(status["map"]["known_area_m2"], area);
+        let verdicts = robot.feed_all(&again[21..40]).await;
+        assert!(verdicts.contains(&"processed".to_owned()), "{verdicts:?}");
+        let pose = robot.pose().await;
+        assert!(apart(pose, there) < 0.25, "{engine:?}: {pose:?}, and not {there:?}");
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
+}
+
+/// The scan of a moment with all walls at one distance, as there are nowhere.
+fn no_walls(moment: &Moment) -> Vec<u8> {
+    let mut scan: ros::LaserScan = ros::decode(&moment.scan, "").unwrap();
+    scan.ranges = vec![2.0; scan.ranges.len()];
+    ros::cdr(&scan)
+}
+
+/// What a daemon says that does not start.
+fn complaint(mesh: &Mesh, state: &Path, arguments: &[&str]) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gmapd"));
+    command.args(["run", "--prefix", "robot01", "--zenoh"]).arg(&mesh.configuration);
+    let output = command.arg("--state").arg(state).args(arguments).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_localizes_without_a_map() {
+    let mesh = Mesh::new().await;
+    let moments = drive(30);
+    for engine in &ENGINES[..2] {
+        let robot = mesh.robot("robot01").await;
+        let localizing = [engine, &["--mode", "localization"][..]].concat();
+        // Its state has no map.
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.ask("slam/cmd/pause").await.unwrap();
+        robot.feed(&moments[0]).await;
+        daemon.terminate(&robot).await;
+        let set = ["--set", "particles=4", "--set", "linearUpdate=0.3"];
+        let error = complaint(&mesh, &mesh.state("robot01"), &[&localizing, &set[..]].concat());
+        assert!(error.contains("no state of this robot with a map to go on from"), "{error}");
+
+        let daemon = Daemon::start(&mesh, &robot, engine).await;
+        robot.ask("slam/cmd/resume").await.unwrap();
+        robot.feed_all(&moments[1..10]).await;
+        daemon.terminate(&robot).await;
+        let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+        assert_eq!(robot.status().await["mode"], "localization");
+        let done = String::from_utf8(robot.ask("slam/cmd/reset").await.unwrap()).unwrap();
+        assert!(done.contains("begins a new map"), "{done}");
+        assert_eq!(robot.status().await["mode"], "mapping");
+        daemon.terminate(&robot).await;
+
+        let daemon = Daemon::start(&mesh, &robot, &localizing).await;
+        let verdicts = robot.feed_all(&moments[10..]).await;
+        assert_eq!(verdicts[0], "processed");
+        assert!(robot.status().await["map"]["known_area_m2"].as_f64() > Some(1.0));
+        daemon.kill(&robot).await;
+        fs::remove_dir_all(mesh.state("robot01")).unwrap();
+    }
+}
+
+/// What takes odometry's poses to such with the origin a few metres from where the robot is.
+fn odometry_elsewhere(moments: &[Moment]) -> Pose2 {
+    Pose2::new(3.0, -2.0, 0.8) * moments[moments.len() - 1].odom_from_base.inverse()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn odometry_that_begins_anew_after_a_power_cut_is_no_motion() {
+    let mesh = Mesh::new().await;
+    let moments = drive_after(120, 1000, Pose2::IDENTITY);
+    let origin = moments[79].odom_from_base;
+    assert!(moments[0].odom_from_base.between(origin).position().norm() > 1.0);
+    let later = |seconds| drive_after(120, seconds, origin.inverse()).split_off(80);
+    for engine in &ENGINES[..2] {
+        let [_, expected] = undisturbed(&mesh, engine, &moments).await;
+        // Stamped later, and by a clock that was set back.
+        for seconds in [2000, 500] {
+            let robot = mesh.robot("robot01").await;
+            let daemon = Daemon::start(&mesh, &robot, engine).await;
+            robot.feed_all(&moments[..80]).await;
+            let before = robot.pose().await;
+            daemon.terminate(&robot).await;
+            let daemon = Daemon::start(&mesh, &robot, engine).await;
+            let anew = later(seconds);
+            robot.feed(&anew[0]).await;
+            robot.feed(&anew[1]).await;
+            robot.feed(&anew[2]).await;
+            let pose = robot.pose().await;
+            assert!(apart(pose, before) < 0.6, "{engine:?} {seconds}: {before:?} to {pose:?}");
+            robot.feed_all(&anew[3..]).await;
+            let status = robot.status().await;
+            assert_eq!(status["filter"]["odometry_restarts"], 1, "{engine:?} {seconds}");
+            let [_, path] = robot.results().await;
+            let [end, expected] = [&path, &expected].map(|path| end_of(path));
+            assert!(apart(end, expected) < 0.3, "{engine:?} {seconds}: {end:?}, not {expected:?}");
+            daemon.kill(&robot).await;
+            fs::remove_dir_all(mesh.state("robot01")).unwrap();
+        }
+    }
+}
+
+/// The last position of a path in TUM's format.
+fn end_of(path: &[u8]) -> Pose2 {
+    let last = std::str::from_utf8(path).unwrap().lines().last().unwrap();
+    let numbers: Vec<f64> = last.split(' ').map(|word| word.parse().unwrap()).collect();
+    Pose2::new(numbers[1], numbers[2], 0.0)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn however_many_ask_a_slow_disk_for_a_checkpoint_one_is_written() {
+    const ASKERS: usize = 4;
+    let mesh = Mesh::new().await;
+    let moments = drive(5);
+    let robot = mesh.robot("robot01").await;
+    let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
+    // Opening a pipe to write waits for somebody who reads, as a disk that does not answer.
+    let name = format!(".checkpoint-0000000001.state.{}.tmp", daemon.0.id());
+    let pipe = mesh.state("robot01").join(name);
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    robot.feed_all(&moments).await;
+    let mut replies = Vec::new();
+    for _ in 0..ASKERS {
+        replies.push(robot.session.get("robot01/slam/cmd/checkpoint").await.unwrap());
+    }
+    // Commands are done in the order in which they come, and this one after those.
+    robot.ask("slam/cmd/pause").await.unwrap();
+    let status = robot.status().await["checkpoint"].take();
+    assert_eq!((&status["written"], &status["error"]), (&Value::from(0), &Value::Null));
+
+    drop(fs::File::open(&pipe).unwrap());
+    for reply in replies {
+        let reply = tokio::time::timeout(PATIENCE, reply.recv_async()).await.unwrap().unwrap();
+        let done = reply.result().unwrap().payload().try_to_string().unwrap().into_owned();
+        assert!(done.contains("the state is in"), "{done}");
+    }
+    // A command that overtook another one costs one more.
+    let written = robot.status().await["checkpoint"]["written"].as_u64().unwrap();
+    assert!(written < ASKERS as u64, "{written}");
+    daemon.kill(&robot).await;
 }

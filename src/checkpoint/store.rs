@@ -94,13 +94,15 @@ impl Store {
     /// When the directory cannot be made or written to, or the disk is full; nothing is deleted
     /// then.
     pub fn write(&mut self, bytes: &[u8]) -> Result<PathBuf, WriteError> {
-        let path = self.path(self.next);
+        let number = self.next;
+        // A file that has its name already may fail to be synced: the next is another in any case.
+        self.next += 1;
+        let path = self.path(number);
         if let Err(source) = fs::create_dir_all(&self.directory) {
             return Err(WriteError { path, source });
         }
         write_atomically(&path, bytes)?;
-        self.good.push_back(self.next);
-        self.next += 1;
+        self.good.push_back(number);
         while self.good.len() > self.keep {
             if let Some(number) = self.good.pop_front() {
                 fs::remove_file(self.path(number)).ok();
@@ -190,5 +192,7 @@ mod tests {
         assert!(error.to_string().ends_with("checkpoint-0000000002.state"), "{error}");
         assert_eq!(numbers(directory.path()), [2, 1]);
         assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 3);
+        assert!(store.write(&good).unwrap().ends_with("checkpoint-0000000003.state"));
+        assert_eq!(numbers(directory.path()), [3, 2], "the good one before is replaced");
     }
 }

@@ -46,7 +46,8 @@ const LAST_BREATH: Duration = Duration::from_millis(100);
     Going on in a map that was saved:\n  \
         gmapd run --map maps/office.yaml                        from where the first scan fits\n  \
         gmapd run --map maps/office.yaml --initial-pose 1.5,-2,0.5\n  \
-        gmapd run --map maps/office.yaml --mode localization    the map stays as it is\n\n\
+        gmapd run --map maps/office.yaml --mode localization    the map stays as it is\n  \
+        gmapd run --state /var/lib/gmapd --initial-pose search  a robot that was carried\n\n\
     Then, from anywhere on the mesh:\n  \
         gmapd get robot01 status                       what it does, and why the map does not grow\n\n\
     Exit codes: 0 ended by a signal, 1 failed, 2 wrong usage, 130 ended by a second signal.")]

@@ -9,7 +9,8 @@ pub(super) struct StartArguments {
     #[arg(long, value_name = "FILE")]
     map: Option<String>,
     /// Pose of the base at the first scan, m, m and rad, or search: where it fits in the map.
-    /// With --map and no pose, it is searched for. The same as --set initial_pose=[X,Y,YAW]
+    /// With --map and no pose, it is searched for; with --state it is where the robot is now. The
+    /// same as --set initial_pose=[X,Y,YAW]
     #[arg(long, value_name = "X,Y,YAW|search", allow_hyphen_values = true)]
     initial_pose: Option<String>,
     /// mapping, or localization, which leaves the map as it is; the same as --set mode=MODE

@@ -57,10 +57,16 @@ fn check_start(entries: &Entries, raw: &RawConfig) -> Result<(), ConfigError> {
     let (key, reason) = match (raw.engine, &raw.map) {
         (EngineKind::KnownPoses, Some(_)) => ("map", "known_poses starts from no map"),
         (EngineKind::KnownPoses, None) if localizes => ("mode", "to known_poses, poses are given"),
+        (EngineKind::KnownPoses, None) if searches => {
+            ("initial_pose", "to known_poses, poses are given")
+        }
         (_, None) if localizes && raw.state_directory.is_none() => {
             ("mode", "a map to localize in is needed: --map, or map, or --state of a run before")
         }
-        (_, None) if searches => ("initial_pose", "a map to search is needed: --map, or map"),
+        (_, None) if searches && raw.state_directory.is_none() => {
+            let reason = "a map to search is needed: --map, or map, or --state of a run before";
+            ("initial_pose", reason)
+        }
         _ => return Ok(()),
     };
     Err(wrong_kind(entries, key, reason))
@@ -211,6 +217,7 @@ fn limits(raw: &RawConfig) -> Vec<(&'static str, f64, Allowed)> {
         ("queries_at_once", raw.queries_at_once as f64, Between(1.0, 1000.0)),
         ("max_message_bytes", raw.max_message_bytes as f64, Between(1024.0, MOST_BYTES)),
         ("max_reply_bytes", raw.max_reply_bytes as f64, Between(65536.0, MOST_BYTES)),
+        ("max_bytes_in_flight", raw.max_bytes_in_flight as f64, Between(65536.0, MOST_BYTES)),
         ("checkpoint", raw.checkpoint.every_s, Between(0.1, 86_400.0)),
         ("checkpoint", raw.checkpoint.every_scans as f64, AtLeast(1.0)),
         ("checkpoint", raw.checkpoint.keep as f64, Between(1.0, 1000.0)),

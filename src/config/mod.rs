@@ -119,14 +119,13 @@ impl Config {
     #[must_use]
     pub fn parameters(&self) -> Parameters {
         let raw = &self.raw;
-        let initial_pose = raw.initial_pose.and_then(InitialPose::numbers);
         Parameters {
             particles: raw.particles,
             throttle_scans: raw.throttle_scans,
             resolution: raw.resolution,
             max_range: raw.max_range,
             max_usable_range: raw.max_usable_range,
-            initial_pose: initial_pose.map(|[x, y, yaw]| Pose2::new(x, y, yaw)),
+            initial_pose: raw.initial_pose.and_then(InitialPose::pose),
             motion_noise: MotionNoise {
                 translation_from_translation: raw.translation_noise_from_translation,
                 translation_from_rotation: raw.translation_noise_from_rotation,

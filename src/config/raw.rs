@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::{gmapping::Parameters, hector, known_map::Mode};
+use crate::slam::{gmapping::Parameters, hector, known_map::Mode, pose::Pose2};
 
 /// All keys of the file. A key that is left out has slam_gmapping's default.
 ///
@@ -66,6 +66,8 @@ pub struct RawConfig {
     pub max_message_bytes: usize,
     /// Bytes of an answer above which it is refused.
     pub max_reply_bytes: usize,
+    /// Bytes of answers that are on their way together.
+    pub max_bytes_in_flight: usize,
     /// File to which inputs and outputs are recorded, MCAP; left out, they are not.
     pub record: Option<String>,
     /// Directory that the state is kept in, to go on from after a restart; left out, it is not kept.
@@ -262,7 +264,7 @@ pub(super) const GMAPPING_ONLY: [(&str, &str); 5] = [
 pub(super) const EXTENT_KEYS: [&str; 4] = ["xmin", "ymin", "xmax", "ymax"];
 
 /// Keys that the state does not depend on: how the mesh and files are met, and what is handed out.
-pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 23] = [
+pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 24] = [
     "map_update_interval",
     "transform_publish_period",
     "tf_delay",
@@ -283,6 +285,7 @@ pub(super) const WITHOUT_EFFECT_ON_STATE: [&str; 23] = [
     "queries_at_once",
     "max_message_bytes",
     "max_reply_bytes",
+    "max_bytes_in_flight",
     "engine",
     "occ_thresh",
     "occ_min_visits",
@@ -325,6 +328,7 @@ impl Default for RawConfig {
             queries_at_once: 64,
             max_message_bytes: 4 << 20,
             max_reply_bytes: 64 << 20,
+            max_bytes_in_flight: 256 << 20,
             record: None,
             state_directory: None,
             checkpoint: Checkpoint::default(),
@@ -410,6 +414,12 @@ pub enum Search {
 }
 
 impl InitialPose {
+    /// The pose of the base in `map`, if one is said.
+    #[must_use]
+    pub fn pose(self) -> Option<Pose2> {
+        self.numbers().map(|[x, y, yaw]| Pose2::new(x, y, yaw))
+    }
+
     /// The numbers, if there are any.
     #[must_use]
     pub const fn numbers(self) -> Option<[f64; 3]> {

@@ -13,6 +13,7 @@ use zenoh::bytes::Encoding;
 
 use super::command::{Command, Done, Request};
 use super::formats::{EmptyMap, FormatError, MapProducts, ProductCache};
+use super::limits::Reason;
 use super::save::{SaveError, SaveName, Saver};
 use super::selector::{
     MapFormat, MessageFormat, PathFormat, Question, RegionForm, RegionQuestion, SelectorError,
@@ -21,6 +22,7 @@ use super::serving::{AskStatus, Settings};
 use super::snapshot::{Estimate, Snapshot};
 use super::tiles::{TileSet, TileStore};
 use crate::convert;
+use crate::map::region::RegionError;
 use crate::ros;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
@@ -72,6 +74,11 @@ pub(super) enum Refusal {
          bbox=, or for larger cells with res="
     )]
     TooLarge { bytes: usize, most: usize },
+    #[error(
+        "answers of {bytes} bytes are on their way already, and max_bytes_in_flight allows {most} \
+         with this one; ask again"
+    )]
+    TooManyBytes { bytes: usize, most: usize },
     #[error("{0} queries are being answered already; ask again")]
     TooMany(usize),
     #[error("too many commands are waiting already; ask again")]
@@ -80,6 +87,24 @@ pub(super) enum Refusal {
     NoReply(Duration),
     #[error("the daemon is stopping; the command was not done")]
     Stopping,
+}
+
+impl Refusal {
+    /// The limit that it is beyond, if it is.
+    pub(super) const fn reason(&self) -> Option<Reason> {
+        match self {
+            Self::Wildcard(_) => Some(Reason::Wildcard),
+            Self::SwitchedOff(_) => Some(Reason::SwitchedOff),
+            Self::TooManyCommands(_) | Self::CommandsWaiting => Some(Reason::TooManyCommands),
+            Self::TooMany(_) => Some(Reason::TooManyQueries),
+            Self::TooLarge { .. }
+            | Self::Format(FormatError::Region(
+                RegionError::TooMuch { .. } | RegionError::TooLong(_),
+            )) => Some(Reason::TooLarge),
+            Self::TooManyBytes { .. } => Some(Reason::TooManyBytes),
+            _ => None,
+        }
+    }
 }
 
 /// As `at=` takes them.
@@ -99,6 +124,7 @@ pub(super) struct Responder {
     tiles: Arc<TileStore>,
     saver: Saver,
     map_frame: String,
+    max_reply_bytes: usize,
 }
 
 impl Responder {
@@ -119,6 +145,7 @@ impl Responder {
             products: Arc::new(ProductCache::new(empty)),
             saver: Saver::new(settings.save_directory.clone()),
             map_frame: settings.map_frame.clone(),
+            max_reply_bytes: settings.limits.max_reply_bytes,
         }
     }
 
@@ -196,10 +223,11 @@ impl Responder {
         let products = self.products_of(snapshot);
         let (payload, encoding) = match &question.form {
             RegionForm::Layers(layers) => {
-                (products.layers(question, layers)?, Encoding::APPLICATION_JSON)
+                let text = products.layers(question, layers, self.max_reply_bytes)?;
+                (text, Encoding::APPLICATION_JSON)
             }
             RegionForm::Map(format) => {
-                let region = products.region(question)?;
+                let region = products.region(question, self.max_reply_bytes)?;
                 let robot_in_map = snapshot.estimate.pose_in_map;
                 (region.map(*format, robot_in_map)?, map_encoding(*format))
             }

@@ -1,9 +1,10 @@
 //! The state on disk: when it is written, on a thread of its own, and which one is gone on from.
 
+use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
@@ -21,7 +22,6 @@ use crate::clock::{self, Stopwatch};
 use crate::config::{self, Config, EngineKind};
 use crate::files::WriteError;
 use crate::slam::engine::Engine;
-use crate::slam::known_map::Mode;
 use crate::slam::pose::Stamp;
 use crate::slam::state::EngineState;
 
@@ -109,8 +109,8 @@ pub enum CheckpointsError {
     Store(#[from] StoreError),
     /// There is no state to localize in, and no map either.
     #[error(
-        "mode is localization, and {} has no state of this robot to go on from: map first, or name \
-         a map",
+        "mode is localization, and {} has no state of this robot with a map to go on from: map \
+         first, or name a map",
         directory.display()
     )]
     NothingToLocalizeIn {
@@ -134,14 +134,21 @@ enum NotWritten {
         #[from]
         error: WriteError,
     },
+    #[error("gmapd has a fault there: {0}")]
+    Panicked(String),
+    #[error("the thread that writes it has ended; restart gmapd")]
+    NoThread,
 }
 
 /// Decides when the state is written, and hands it to the thread `checkpoint`.
 #[derive(Debug)]
 pub(super) struct Keeper {
     jobs: Sender<Job>,
+    status: SharedStatus,
     /// Jobs that are not done yet.
     pending: Arc<AtomicUsize>,
+    /// Who waits for a state to be on the disk, and is in no job yet.
+    asked: Vec<oneshot::Sender<Done>>,
     every: Duration,
     every_scans: u64,
     /// When the last was handed on, and the scans that had their verdict by then.
@@ -155,7 +162,25 @@ pub(super) struct Keeper {
 struct Job {
     engine: Engine,
     mapper: MapperState,
-    done: Option<oneshot::Sender<Done>>,
+    asked: Vec<oneshot::Sender<Done>>,
+    _pending: Pending,
+}
+
+/// Counts a job until it is done, whatever becomes of it.
+#[derive(Debug)]
+struct Pending(Arc<AtomicUsize>);
+
+impl Pending {
+    fn new(pending: &Arc<AtomicUsize>) -> Self {
+        pending.fetch_add(1, Ordering::AcqRel);
+        Self(Arc::clone(pending))
+    }
+}
+
+impl Drop for Pending {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::AcqRel);
+    }
 }
 
 impl Keeper {
@@ -164,41 +189,68 @@ impl Keeper {
         self.commanded = true;
     }
 
+    /// Has the state written as soon as the one before is; `done` hears when it is on the disk.
+    ///
+    /// However many ask while the disk is slow, one state is written for all of them.
+    pub(super) fn ask(&mut self, done: oneshot::Sender<Done>) {
+        self.asked.retain(|done| !done.is_closed());
+        self.asked.push(done);
+    }
+
     /// Whether the state is to be written now, with so many scans that had their verdict.
     pub(super) fn is_due(&self, now: Instant, scans: u64) -> bool {
         let (since, before) = self.last;
-        let late = scans != before && now >= since + self.every;
-        (late || self.is_pressing(scans)) && self.pending.load(Ordering::Acquire) == 0
+        let late = now >= since + self.every && (scans != before || self.has_failed());
+        !self.is_writing() && (late || self.is_pressing(scans))
     }
 
     /// Whether it is to be written as soon as the one before is.
     fn is_pressing(&self, scans: u64) -> bool {
-        self.commanded || scans.saturating_sub(self.last.1) >= self.every_scans
+        let many = scans.saturating_sub(self.last.1) >= self.every_scans;
+        self.commanded || !self.asked.is_empty() || many
     }
 
-    /// When to look again though nothing comes; `None` if nothing has changed.
+    fn is_writing(&self) -> bool {
+        self.pending.load(Ordering::Acquire) > 0
+    }
+
+    /// Whether the last is not on the disk.
+    fn has_failed(&self) -> bool {
+        locked(&self.status).error.is_some()
+    }
+
+    /// When to look again though nothing comes; `None` if all that is known is on the disk.
     pub(super) fn deadline(&self, now: Instant, scans: u64) -> Option<Instant> {
         let (since, before) = self.last;
         let soon = now + LOOK;
         if self.is_pressing(scans) {
             return Some(soon);
         }
-        (scans != before).then(|| soon.max(since + self.every))
+        // What is being written may fail.
+        let unsettled = scans != before || self.is_writing() || self.has_failed();
+        unsettled.then(|| soon.max(since + self.every))
     }
 
-    /// Hands a state to the thread; `done` hears when it is on the disk.
-    pub(super) fn write(
-        &mut self,
-        engine: Engine,
-        mapper: MapperState,
-        done: Option<oneshot::Sender<Done>>,
-    ) {
+    /// Hands a state to the thread; those who asked hear when it is on the disk.
+    pub(super) fn write(&mut self, engine: Engine, mapper: MapperState) {
         self.last = (clock::now(), mapper.scans());
         self.commanded = false;
-        self.pending.fetch_add(1, Ordering::AcqRel);
-        // The thread ends with the keeper, never before.
-        self.jobs.send(Job { engine, mapper, done }).ok();
+        let (asked, pending) = (std::mem::take(&mut self.asked), Pending::new(&self.pending));
+        if let Err(unsent) = self.jobs.send(Job { engine, mapper, asked, _pending: pending }) {
+            tell(unsent.0.asked, &note(&self.status, Err(NotWritten::NoThread)));
+        }
     }
+}
+
+/// Whoever asked may be gone.
+fn tell(asked: Vec<oneshot::Sender<Done>>, done: &Done) {
+    for asker in asked {
+        asker.send(done.clone()).ok();
+    }
+}
+
+fn locked(status: &SharedStatus) -> MutexGuard<'_, CheckpointStatus> {
+    status.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Goes on from the newest checkpoint that is good, if the configuration has a directory for them,
@@ -212,21 +264,29 @@ pub(super) fn attach(
     let config::Checkpoint { every_s, every_scans, keep } = config.raw.checkpoint;
     let store = Store::new(directory.as_ref(), keep)?;
     let own = own_head(config, prefix);
-    let status = resume(mapper, store.directory(), &own);
-    let knows_a_map = status.resumed_from.is_some() || config.raw.map.is_some();
-    if config.raw.mode == Mode::Localization && !knows_a_map {
+    let (status, head) = resume(mapper, store.directory(), &own);
+    if mapper.localizes_in_nothing() {
         let directory = store.directory().to_owned();
         return Err(CheckpointsError::NothingToLocalizeIn { directory });
     }
+    // Where the robot was said to be is written at once: from the next restart on it is old.
+    let commanded = head.is_some_and(|head| head.has_other_pose(&own));
     let status = Arc::new(Mutex::new(status));
     let (jobs, waiting) = channel();
     let pending = Arc::new(AtomicUsize::new(0));
-    let writer = Writer { store, own, status: Arc::clone(&status), pending: Arc::clone(&pending) };
+    let writer = Writer { store, own, status: Arc::clone(&status) };
     let thread = std::thread::Builder::new().name("checkpoint".to_owned());
     thread.spawn(move || writer.run(&waiting)).map_err(CheckpointsError::Thread)?;
-    let every = Duration::from_secs_f64(every_s);
-    let last = (clock::now(), mapper.scans());
-    mapper.keep_state(Keeper { jobs, pending, every, every_scans, last, commanded: false });
+    mapper.keep_state(Keeper {
+        jobs,
+        status: Arc::clone(&status),
+        pending,
+        asked: Vec::new(),
+        every: Duration::from_secs_f64(every_s),
+        every_scans,
+        last: (clock::now(), mapper.scans()),
+        commanded,
+    });
     Ok(Some(status))
 }
 
@@ -247,12 +307,13 @@ fn own_head(config: &Config, prefix: &Prefix) -> Head {
         particles: 0,
         stamp: None,
         map: None,
+        searching: false,
         body_bytes: 0,
     }
 }
 
-/// Goes on from the newest checkpoint that is good and of this daemon's kind.
-fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus {
+/// Goes on from the newest checkpoint that is good and of this daemon's kind, and has its head.
+fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> (CheckpointStatus, Option<Head>) {
     let mut status = CheckpointStatus {
         directory: directory.to_owned(),
         resumed_from: None,
@@ -269,7 +330,7 @@ fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus
                 tracing::info!("going on from {path}, with {scans} scans in the map");
                 status.resumed_stamp = head.stamp;
                 status.resumed_from = Some(name(&path.to_string()));
-                break;
+                return (status, Some(head));
             }
             Err(refusal) => {
                 tracing::warn!("{} is not gone on from: {refusal}", path.display());
@@ -278,10 +339,8 @@ fn resume(mapper: &mut Mapper, directory: &Path, own: &Head) -> CheckpointStatus
             }
         }
     }
-    if status.resumed_from.is_none() {
-        tracing::info!("no state to go on from in {}: mapping begins anew", directory.display());
-    }
-    status
+    tracing::info!("no state to go on from in {}: mapping begins anew", directory.display());
+    (status, None)
 }
 
 fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Refusal> {
@@ -293,6 +352,12 @@ fn resume_from(mapper: &mut Mapper, path: &Path, own: &Head) -> Result<Head, Ref
     // Otherwise it is as the last command left it.
     if opened.head.settings.get(MODE) != own.settings.get(MODE) {
         mapper.take_configured_mode();
+    }
+    if opened.head.searching {
+        mapper.search_pose();
+    }
+    if opened.head.has_other_pose(own) {
+        mapper.take_configured_pose();
     }
     Ok(opened.head)
 }
@@ -307,19 +372,17 @@ struct Writer {
     store: Store,
     own: Head,
     status: SharedStatus,
-    pending: Arc<AtomicUsize>,
 }
 
 impl Writer {
     /// Until the mapper ends.
     fn run(mut self, jobs: &Receiver<Job>) {
         self.store.adopt(&self.own);
-        while let Ok(Job { engine, mapper, done }) = jobs.recv() {
-            let written = self.write(engine, mapper);
-            let told = self.note(written);
-            self.pending.fetch_sub(1, Ordering::AcqRel);
-            // Whoever asked may be gone.
-            done.map(|done| done.send(told).ok());
+        while let Ok(Job { engine, mapper, asked, _pending: pending }) = jobs.recv() {
+            let written = caught(|| self.write(engine, mapper));
+            let done = note(&self.status, written);
+            drop(pending);
+            tell(asked, &done);
         }
     }
 
@@ -355,34 +418,67 @@ impl Writer {
             particles: engine.hypotheses().len() as u64,
             stamp: mapper.taken(),
             map,
+            searching: engine.is_searching(),
             ..self.own.clone()
         };
         (head, engine.state())
     }
+}
 
-    /// Puts it in the status, and in the log where it is new that something is wrong or right.
-    fn note(&self, written: Result<WrittenCheckpoint, NotWritten>) -> Done {
-        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
-        match written {
-            Ok(written) => {
-                if status.error.take().is_some() {
-                    tracing::info!("checkpoints are written again");
-                }
-                let WrittenCheckpoint { file, bytes, milliseconds, .. } = &written;
-                tracing::debug!(file, bytes, milliseconds, "checkpoint");
-                let done = format!("the state is in {}", status.directory.join(file).display());
-                status.written += 1;
-                status.last = Some(written);
-                Done { done, changed: true }
+/// A fault in what makes a checkpoint is an error as any other, and the next is tried.
+fn caught<T>(work: impl FnOnce() -> Result<T, NotWritten>) -> Result<T, NotWritten> {
+    std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+        Err(NotWritten::Panicked(text.unwrap_or_default()))
+    })
+}
+
+/// Puts it in the status, and in the log where it is new that something is wrong or right.
+fn note(status: &SharedStatus, written: Result<WrittenCheckpoint, NotWritten>) -> Done {
+    let mut status = locked(status);
+    match written {
+        Ok(written) => {
+            if status.error.take().is_some() {
+                tracing::info!("checkpoints are written again");
             }
-            Err(error) => {
-                let done = format!("the state is not written: {error}");
-                if status.error.as_ref() != Some(&done) {
-                    tracing::error!("{done}; mapping goes on");
-                    status.error = Some(done.clone());
-                }
-                Done { done, changed: false }
-            }
+            let WrittenCheckpoint { file, bytes, milliseconds, .. } = &written;
+            tracing::debug!(file, bytes, milliseconds, "checkpoint");
+            let done = format!("the state is in {}", status.directory.join(file).display());
+            status.written += 1;
+            status.last = Some(written);
+            Done { done, changed: true }
         }
+        Err(error) => {
+            let done = format!("the state is not written: {error}");
+            if status.error.as_ref() != Some(&done) {
+                tracing::error!("{done}; mapping goes on");
+                status.error = Some(done.clone());
+            }
+            Done { done, changed: false }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_in_what_writes_is_told_as_any_other_error() {
+        let written = caught::<()>(|| panic!("a cell is missing")).unwrap_err();
+        assert_eq!(written.to_string(), "gmapd has a fault there: a cell is missing");
+        assert!(caught(|| Ok(())).is_ok());
+    }
+
+    #[test]
+    fn a_job_counts_until_it_is_gone_whatever_became_of_it() {
+        let pending = Arc::new(AtomicUsize::new(0));
+        let (jobs, waiting) = channel();
+        jobs.send(Pending::new(&pending)).unwrap();
+        assert_eq!(pending.load(Ordering::Acquire), 1);
+        drop(waiting);
+        jobs.send(Pending::new(&pending)).unwrap_err();
+        assert_eq!(pending.load(Ordering::Acquire), 0);
     }
 }

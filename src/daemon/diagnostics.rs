@@ -82,6 +82,7 @@ mod tests {
             filter: FilterStatus { particles: 30, ..FilterStatus::default() },
             map: None,
             checkpoint: None,
+            refused: BTreeMap::new(),
             peak_memory_bytes: None,
             seed: 1,
         }

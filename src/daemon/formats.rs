@@ -181,29 +181,38 @@ impl MapProducts {
         self.png.get_or_init(encode).clone()
     }
 
-    /// A part of the map in coarser cells, as a map that can be had in all formats.
+    /// A part of the map in coarser cells, as a map that can be had in all formats; `most` is how
+    /// many bytes an answer may have.
     ///
     /// # Errors
     /// When its cells would be too fine or too many.
-    pub fn region(&self, asked: &RegionQuestion) -> Result<Self, FormatError> {
+    pub fn region(&self, asked: &RegionQuestion, most: usize) -> Result<Self, FormatError> {
         let region = self.cells_of(asked)?;
+        region.check_size(1, most)?;
         let (map, threshold) = self.counted();
         let grid = region.occupancy(map, threshold);
         let part = Self::new(self.version.clone(), self.empty.clone());
         Ok(Self { grid: OnceLock::from(grid), ..part })
     }
 
-    /// Layers of a part of the map, as JSON.
+    /// Layers of a part of the map, as JSON of at most so many bytes.
     ///
     /// # Errors
     /// When its cells would be too fine or too many.
-    pub fn layers(&self, asked: &RegionQuestion, layers: &[Layer]) -> Result<Bytes, FormatError> {
+    pub fn layers(
+        &self,
+        asked: &RegionQuestion,
+        layers: &[Layer],
+        most: usize,
+    ) -> Result<Bytes, FormatError> {
         let known = self.version.as_ref().map(|version| Known {
             map: &version.occupancy,
             threshold: version.occupied_threshold,
             last_seen: &self.last_seen,
         });
-        Ok(self.cells_of(asked)?.json(layers, known).into())
+        let region = self.cells_of(asked)?;
+        region.check_size(layers.len(), most)?;
+        Ok(region.json(layers, known, most)?.into())
     }
 
     fn counted(&self) -> (Option<&OccupancyMap>, OccupiedThreshold) {

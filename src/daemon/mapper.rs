@@ -21,7 +21,7 @@ use super::synchronizer::{
     self, Call, Channel, Need, ReadyScan, Refusal, ScanCounts, Sought, Synchronizer,
 };
 use crate::clock::{self, Stopwatch};
-use crate::config::{Config, EngineKind, OdometrySource};
+use crate::config::{Config, EngineKind, InitialPose, OdometrySource};
 use crate::convert::FramedPose;
 use crate::slam::engine::{Engine, Sweep};
 use crate::slam::known_map::Mode;
@@ -68,6 +68,9 @@ pub struct Gauges {
     pub laser: Option<LaserMount>,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Times odometry began anew after a restart.
+    #[serde(skip)]
+    pub odometry_restarts: u64,
     /// Where odometry comes from.
     #[serde(skip)]
     pub channel: Option<Channel>,
@@ -101,8 +104,8 @@ pub struct Gauges {
 pub struct Mapper {
     connections: Connections,
     engine: Engine,
-    /// As configured: where the first scan is, and what a jump is.
-    initial_pose: Option<Pose2>,
+    /// As configured: where the robot is at first, and what a jump is.
+    initial_pose: Option<InitialPose>,
     first_mode: Mode,
     jump: JumpGuard,
     /// Seconds between two versions of the map while scans wait.
@@ -208,7 +211,7 @@ impl Mapper {
         let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
-            initial_pose: parameters.initial_pose,
+            initial_pose: config.raw.initial_pose,
             first_mode: config.raw.mode,
             jump: parameters.jump,
             map_update_interval: config.raw.map_update_interval,
@@ -230,10 +233,15 @@ impl Mapper {
     /// A map to start from is told before any scan, so that a pose can be pointed at.
     fn show_start(&mut self) {
         self.view.mode = self.engine.mode();
-        if self.engine.occupancy().counts().tiles().next().is_some() {
+        if self.knows_a_map() {
             self.view.unpublished = Some(Stamp(0));
             self.renew_map();
         }
+    }
+
+    /// Whether there is a map to localize in.
+    pub(super) fn knows_a_map(&mut self) -> bool {
+        self.engine.occupancy().counts().tiles().next().is_some()
     }
 
     /// Works until the mailbox is closed and empty, or later than it may be.
@@ -283,15 +291,14 @@ impl Mapper {
     fn checkpoint_if_due(&mut self) {
         let scans = self.scans();
         if self.keeper.as_ref().is_some_and(|keeper| keeper.is_due(clock::now(), scans)) {
-            self.checkpoint(None);
+            self.checkpoint();
         }
     }
 
-    /// Has the state written; without a keeper, whoever waits for it hears nothing.
-    fn checkpoint(&mut self, done: Option<oneshot::Sender<Done>>) {
+    fn checkpoint(&mut self) {
         let (engine, state) = (self.engine.clone(), self.state());
         if let Some(keeper) = &mut self.keeper {
-            keeper.write(engine, state, done);
+            keeper.write(engine, state);
         }
     }
 
@@ -368,7 +375,18 @@ impl Mapper {
             }
             Call::Scan(ready) => self.add_scan(&ready),
             Call::Refuse(refusal) => self.refuse(refusal),
+            Call::BeginOdometry(odom_from_base) => self.begin_odometry(odom_from_base),
         }
+    }
+
+    /// The robot is where it was, and odometry counts from there.
+    fn begin_odometry(&mut self, odom_from_base: Pose2) {
+        let place = in_words(odom_from_base);
+        tracing::warn!("odometry begins anew at {place}: it is no motion of the robot");
+        self.gauges.odometry_restarts += 1;
+        self.engine.forget_odometry();
+        self.add_odometry(odom_from_base);
+        self.renew_estimate(self.view.estimate.stamp);
     }
 
     fn add_odometry(&mut self, odom_from_base: Pose2) {
@@ -453,7 +471,8 @@ impl Mapper {
         let estimate = &mut self.view.estimate;
         estimate.pose_in_map = self.engine.pose_in_map();
         estimate.map_from_odom = self.engine.map_from_odom();
-        estimate.stamp = if self.engine.has_begun() { stamp } else { None };
+        let known = self.engine.has_begun() && !self.engine.is_searching();
+        estimate.stamp = stamp.filter(|_| known);
         self.view.changed = true;
         self.follow_odometry();
     }
@@ -490,10 +509,10 @@ impl Mapper {
 
     /// Whoever gets the answer finds it in the snapshot, too.
     fn obey(&mut self, request: Request) {
+        if let (Command::Checkpoint, Some(keeper)) = (request.command, &mut self.keeper) {
+            return keeper.ask(request.reply);
+        }
         let (done, changed) = match request.command {
-            Command::Checkpoint if self.keeper.is_some() => {
-                return self.checkpoint(Some(request.reply));
-            }
             Command::Checkpoint => {
                 ("the state is not kept: neither --state nor state_directory is set".into(), false)
             }
@@ -506,7 +525,7 @@ impl Mapper {
         tracing::info!(command = ?request.command, done, "command");
         self.view.changed = true;
         self.publish();
-        if let Some(keeper) = &mut self.keeper {
+        if let Some(keeper) = self.keeper.as_mut().filter(|_| changed) {
             keeper.note_command();
         }
         // Whoever asked may be gone.
@@ -547,8 +566,11 @@ impl Mapper {
 
     fn reset(&mut self, pose_in_map: Option<Pose2>) -> (String, bool) {
         let epoch = self.epoch() + 1;
-        self.engine.reset(pose_in_map.or(self.initial_pose));
-        self.engine.set_mode(self.first_mode);
+        let pose_in_map = pose_in_map.or(self.initial_pose.and_then(InitialPose::pose));
+        self.engine.reset(pose_in_map);
+        // Without a map to start from, there is none to localize in.
+        let mode = if self.knows_a_map() { self.first_mode } else { Mode::Mapping };
+        self.engine.set_mode(mode);
         let before = std::mem::replace(&mut self.view, View::new());
         self.view.ledger = before.ledger;
         self.view.paused = before.paused;
@@ -559,7 +581,7 @@ impl Mapper {
         self.gauges.weakness.clear();
         self.show_start();
         self.renew_estimate(None);
-        let at = match pose_in_map.or(self.initial_pose) {
+        let at = match pose_in_map {
             Some(pose) => format!("at {}", in_words(pose)),
             None if self.view.map.is_some() => "where it fits".to_owned(),
             None => "where odometry says".to_owned(),
@@ -603,9 +625,10 @@ impl Mapper {
 
     /// Scans that wait for their odometry are in the state, and wait on after the restart.
     fn checkpoint_last(&mut self) {
-        if self.keeper.is_some() {
+        if let Some(keeper) = &mut self.keeper {
             let (done, written) = oneshot::channel();
-            self.checkpoint(Some(done));
+            keeper.ask(done);
+            self.checkpoint();
             // The thread tells of what goes wrong.
             written.blocking_recv().ok();
         }

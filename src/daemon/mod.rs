@@ -249,6 +249,7 @@ impl Daemon {
             verdicts: daemon.verdicts(),
             commands: daemon.commands(),
             status: asked(&daemon.status),
+            refusals: daemon.status.refusals(),
         };
         let served = serving::Settings::new(&config, daemon.saving.directory());
         daemon.serving = Some(Serving::start(session, node, served, sources).await?);

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::runtime::Handle;
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::task::{JoinHandle, spawn_blocking};
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::key_expr::OwnedKeyExpr;
@@ -13,7 +13,7 @@ use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait as _};
 
 use super::answers::{Answer, Refusal, Responder};
-use super::limits::{Limits, Rate};
+use super::limits::{InFlight, Limits, Rate, Reason, Refusals, Room};
 use super::ros_node::RosNode;
 use super::selector::Topic;
 use super::serving::ServingError;
@@ -25,7 +25,7 @@ use crate::ros::graph::rmw_zenoh::Attachment;
 /// half of the time, and nobody waits longer.
 const TURNS: usize = 2;
 
-/// A client that does not read in this time gives its turn on, while its reply goes on.
+/// A client that does not read an answer in this time gives its turn on, while its reply goes on.
 const LONGEST_TURN: Duration = Duration::from_millis(50);
 
 /// Commands that are done at once; they have their own places, for they wait for the filter.
@@ -52,7 +52,7 @@ pub(super) struct Queryables {
     declared: Vec<Queryable<()>>,
     counter: Counter,
     queries_at_once: u32,
-    refusals: JoinHandle<()>,
+    refusing: JoinHandle<()>,
 }
 
 /// Where queries are taken in.
@@ -68,6 +68,8 @@ struct Counter {
     refused: mpsc::Sender<Query>,
     limits: Arc<Limits>,
     rate: Arc<Rate>,
+    in_flight: Arc<InFlight>,
+    refusals: Arc<Refusals>,
     runtime: Handle,
 }
 
@@ -78,6 +80,7 @@ impl Queryables {
         node: &mut RosNode,
         responder: Arc<Responder>,
         limits: Limits,
+        refusals: Arc<Refusals>,
     ) -> Result<Self, ServingError> {
         let (refused, waiting) = mpsc::channel(REFUSALS_WAITING);
         let queries_at_once = limits.queries_at_once;
@@ -87,7 +90,9 @@ impl Queryables {
             turns: Arc::new(Semaphore::new(TURNS)),
             commands: Arc::new(Semaphore::new(COMMANDS_AT_ONCE)),
             refused,
+            refusals,
             rate: Arc::new(Rate::new(limits.commands_per_second)),
+            in_flight: InFlight::new(limits.max_bytes_in_flight),
             limits: Arc::new(limits),
             runtime: Handle::current(),
         };
@@ -100,13 +105,13 @@ impl Queryables {
         if let Some(key) = node.service(topic.name(), GET_MAP)? {
             declared.push(counter.declare(session, topic, key, Asker::RosNode).await?);
         }
-        let refusals = tokio::spawn(refuse_all(waiting, queries_at_once));
-        Ok(Self { declared, counter, queries_at_once: queries_at_once as u32, refusals })
+        let refusing = tokio::spawn(refuse_all(waiting, queries_at_once));
+        Ok(Self { declared, counter, queries_at_once: queries_at_once as u32, refusing })
     }
 
     /// Takes no more queries, and waits until those that came are answered.
     pub(super) async fn stop(self) {
-        let Self { declared, counter, queries_at_once, refusals } = self;
+        let Self { declared, counter, queries_at_once, refusing } = self;
         // It blocks while the network is slow.
         let undeclare = move || {
             for queryable in declared {
@@ -118,7 +123,7 @@ impl Queryables {
         spawn_blocking(undeclare).await.ok();
         counter.answers.acquire_many(queries_at_once).await.ok();
         counter.commands.acquire_many(COMMANDS_AT_ONCE as u32).await.ok();
-        refusals.abort();
+        refusing.abort();
     }
 }
 
@@ -146,6 +151,11 @@ impl Counter {
         }
         let places = if topic.command().is_some() { &self.commands } else { &self.answers };
         let Ok(place) = places.clone().try_acquire_owned() else {
+            let reason = match topic.command() {
+                Some(_) => Reason::TooManyCommands,
+                None => Reason::TooManyQueries,
+            };
+            self.refusals.note(reason, &"too many come at once", clock::now());
             let may_wait = query.parameters().as_str().len() <= LONGEST_WAITING;
             if !may_wait || self.refused.try_send(query).is_err() {
                 tracing::debug!(%key, "a query ends without a reply: too many come at once");
@@ -153,10 +163,21 @@ impl Counter {
             return;
         };
         let counter = self.clone();
-        let answering = move || {
+        let answering = move |built: oneshot::Sender<()>| {
             let answer = counter.answer(topic, &query);
-            let answer = answer.map(|answer| asker.sign(answer, &query));
+            // Whoever has no turn does not listen.
+            built.send(()).ok();
+            if let Err(refusal) = &answer
+                && let Some(reason) = refusal.reason()
+            {
+                counter.refusals.note(reason, refusal, clock::now());
+            }
+            let (answer, room) = answer.map_or_else(
+                |refusal| (Err(refusal), None),
+                |(answer, room)| (Ok(asker.sign(answer, &query)), Some(room)),
+            );
             reply(&query, &key, answer);
+            drop(room);
             // Whoever asked is told that nothing more comes before the place is free again.
             drop(query);
             drop(place);
@@ -164,18 +185,18 @@ impl Counter {
         if topic.is_large() {
             self.runtime.spawn(in_turn(self.turns.clone(), answering));
         } else {
-            self.runtime.spawn_blocking(answering);
+            self.runtime.spawn_blocking(move || answering(oneshot::channel().0));
         }
     }
 
-    fn answer(&self, topic: Topic, query: &Query) -> Result<Answer, Refusal> {
+    /// The answer, and its room among those that are on their way.
+    fn answer(&self, topic: Topic, query: &Query) -> Result<(Answer, Room), Refusal> {
         let limits = &self.limits;
         if let Some(command) = topic.command() {
             if query.key_expr().is_wild() {
                 return Err(Refusal::Wildcard(topic.name()));
             }
             if !limits.commands.contains(&command) {
-                tracing::warn!(command = topic.name(), "refused a command that is switched off");
                 return Err(Refusal::SwitchedOff(topic.name()));
             }
         }
@@ -188,14 +209,24 @@ impl Counter {
         if bytes > limits.max_reply_bytes {
             return Err(Refusal::TooLarge { bytes, most: limits.max_reply_bytes });
         }
-        Ok(answer)
+        let most = limits.max_bytes_in_flight;
+        let room = self.in_flight.room(bytes);
+        let room = room.map_err(|bytes| Refusal::TooManyBytes { bytes, most })?;
+        Ok((answer, room))
     }
 }
 
-/// First come, first served.
-async fn in_turn(turns: Arc<Semaphore>, answering: impl FnOnce() + Send + 'static) {
+/// First come, first served. A turn lasts until the answer is built, however long that takes: so
+/// few are in memory at once that nobody reads yet.
+async fn in_turn(
+    turns: Arc<Semaphore>,
+    answering: impl FnOnce(oneshot::Sender<()>) + Send + 'static,
+) {
     let turn = turns.acquire_owned().await;
-    tokio::time::timeout(LONGEST_TURN, spawn_blocking(answering)).await.ok();
+    let (built, ready) = oneshot::channel();
+    let sent = spawn_blocking(move || answering(built));
+    ready.await.ok();
+    tokio::time::timeout(LONGEST_TURN, sent).await.ok();
     drop(turn);
 }
 
@@ -236,5 +267,31 @@ async fn refuse_all(mut waiting: mpsc::Receiver<Query>, queries_at_once: usize) 
             query.reply_err(refusal).encoding(Encoding::TEXT_PLAIN).wait().ok();
         };
         spawn_blocking(refuse).await.ok();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_turn_lasts_until_the_answer_is_built_and_little_longer() {
+        let turns = Arc::new(Semaphore::new(1));
+        let (build, wait_to_build) = std::sync::mpsc::channel::<()>();
+        let (read, wait_to_read) = std::sync::mpsc::channel::<()>();
+        let first = tokio::spawn(in_turn(turns.clone(), move |built| {
+            wait_to_build.recv().ok();
+            built.send(()).ok();
+            wait_to_read.recv().ok();
+        }));
+        let (began, mut second) = oneshot::channel();
+        tokio::task::yield_now().await;
+        tokio::spawn(in_turn(turns, move |_built| began.send(()).unwrap()));
+        tokio::time::sleep(4 * LONGEST_TURN).await;
+        assert!(second.try_recv().is_err(), "the first is not built");
+        build.send(()).unwrap();
+        second.await.expect("its turn comes though the first is not read");
+        read.send(()).unwrap();
+        first.await.unwrap();
     }
 }

@@ -17,7 +17,7 @@ use super::command::Request;
 use super::formats::ProductCache;
 use super::keys::KeyError;
 use super::ledger::Entry;
-use super::limits::Limits;
+use super::limits::{Limits, Refusals};
 use super::outputs;
 use super::queries::Queryables;
 use super::ros_node::RosNode;
@@ -119,6 +119,8 @@ pub struct Sources {
     pub commands: mpsc::Sender<Request>,
     /// Tells how the daemon is.
     pub status: AskStatus,
+    /// Takes what is refused.
+    pub refusals: Arc<Refusals>,
 }
 
 /// Why nothing can be served.
@@ -159,7 +161,7 @@ impl Serving {
         settings: Settings,
         sources: Sources,
     ) -> Result<Self, ServingError> {
-        let Sources { snapshots, verdicts, commands, status } = sources;
+        let Sources { snapshots, verdicts, commands, status, refusals } = sources;
         let run = run_number(&session.zid().to_string(), clock::unix_nanoseconds());
         let responder =
             Arc::new(Responder::new(&settings, run, snapshots.clone(), status.clone(), commands));
@@ -175,7 +177,8 @@ impl Serving {
         declare.map_updates(&settings, &snapshots, products, &mut tasks).await?;
         declare.verdicts(verdicts, &mut tasks).await?;
         let limits = settings.limits.clone();
-        let queryables = Queryables::declare(session, &mut node, responder, limits).await?;
+        let queryables =
+            Queryables::declare(session, &mut node, responder, limits, refusals).await?;
         let announced = node.announce(session).await?;
         let key = node.prefix().key(ALIVE)?;
         let alive = session.liveliness().declare_token(key.clone()).await;

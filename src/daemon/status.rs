@@ -13,6 +13,7 @@ use super::input::{Inbox, Input};
 use super::judgement::{self, Circumstances};
 use super::keys::InputKeys;
 use super::ledger::Verdict;
+use super::limits::{Reason, Refusals};
 use super::links::{Links, LinksStatus};
 use super::mailbox::Mailbox;
 use super::mapper::Gauges;
@@ -66,6 +67,8 @@ pub struct Status {
     pub map: Option<MapStatus>,
     /// The state on disk; `null` if it is not kept.
     pub checkpoint: Option<CheckpointStatus>,
+    /// What was asked for and refused, by reason; all reasons are there.
+    pub refused: BTreeMap<Reason, u64>,
     /// The most memory the process has had resident, bytes.
     pub peak_memory_bytes: Option<u64>,
     /// Seed of the random numbers.
@@ -106,6 +109,8 @@ pub struct FilterStatus {
     pub resamples: u64,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Times odometry began anew after a restart, as after a power cut; 1 at most.
+    pub odometry_restarts: u64,
     /// Scans that went without odometry; only engines that can do without have such.
     pub scans_without_odometry: u64,
     /// Processed scans that left a direction open, where the engine looks for it.
@@ -144,6 +149,7 @@ pub struct StatusSource {
     snapshots: watch::Receiver<Arc<Snapshot>>,
     links: Arc<Links>,
     checkpoints: Option<SharedStatus>,
+    refusals: Arc<Refusals>,
     /// Of the version of the map that was asked for last.
     map: Mutex<Option<MapStatus>>,
 }
@@ -175,8 +181,15 @@ impl StatusSource {
             snapshots,
             links,
             checkpoints,
+            refusals: Arc::default(),
             map,
         }
+    }
+
+    /// Where what is refused is counted.
+    #[must_use]
+    pub fn refusals(&self) -> Arc<Refusals> {
+        Arc::clone(&self.refusals)
     }
 
     /// What the daemon is doing now, in a word and a sentence.
@@ -235,6 +248,7 @@ impl StatusSource {
             filter: filter_status(&snapshot, &gauges),
             map: snapshot.map.as_deref().map(|map| self.map_status(map)),
             checkpoint: self.checkpoints.as_ref().map(told),
+            refused: self.refusals.counts(),
             peak_memory_bytes: clock::peak_resident_memory(),
             engine: self.engine,
             links: self.links.status(),
@@ -323,6 +337,7 @@ fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
         effective_sample_size: report.map(|report| report.effective_sample_size),
         resamples: snapshot.resamples,
         odometry_jumps: gauges.odometry_jumps,
+        odometry_restarts: gauges.odometry_restarts,
         scans_without_odometry: gauges.without_odometry,
         weak_directions: gauges.weak,
         weak_direction: report.and_then(|report| report.weak_direction),

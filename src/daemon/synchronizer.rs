@@ -124,6 +124,8 @@ pub enum Call {
     Scan(ReadyScan),
     /// A scan does not reach the filter.
     Refuse(Refusal),
+    /// Odometry begins anew here: where it was before says nothing.
+    BeginOdometry(Pose2),
 }
 
 /// A scan with all that is needed to use it.
@@ -259,9 +261,16 @@ impl Synchronizer {
         if !self.listens_to(channel) {
             return false;
         }
-        if self.again.knows_odometry(stamp) && self.odometry.is_too_late(stamp) {
+        let forgotten = self.odometry.is_too_late(stamp) || self.odometry.is_empty();
+        if self.again.knows_odometry(stamp) && forgotten {
             self.odometry.count_duplicate();
             return true;
+        }
+        if let Some(pause) = self.odometry.newest().map(|newest| stamp.seconds_since(newest))
+            && pause > 0.0
+            && self.again.odometry_begins_anew(odom_from_base, pause)
+        {
+            self.begin_odometry(odom_from_base);
         }
         // What is about to be forgotten, for this sample comes long after it.
         self.feed(Stamp(stamp.0.saturating_sub(HORIZON)));
@@ -269,12 +278,24 @@ impl Synchronizer {
         self.odometry.insert(stamp, odom_from_base);
         if self.odometry.counts().restarts > restarts {
             self.fed = None;
+            if self.again.odometry_begins_anew(odom_from_base, f64::INFINITY) {
+                self.calls.push_back(Call::BeginOdometry(odom_from_base));
+            }
         }
         self.release(frames);
         if let Some(newest) = self.odometry.newest() {
             self.feed(Stamp(newest.0.saturating_sub(HORIZON)));
         }
         true
+    }
+
+    /// The filter gets what is left of the odometry so far, and nothing is between that and this.
+    fn begin_odometry(&mut self, odom_from_base: Pose2) {
+        if let Some(newest) = self.odometry.newest() {
+            self.feed(newest);
+        }
+        self.odometry.clear();
+        self.calls.push_back(Call::BeginOdometry(odom_from_base));
     }
 
     /// Whether odometry of a channel is used; messages take the place of transforms until the
@@ -347,7 +368,7 @@ impl Synchronizer {
             if suspect.is_some_and(follows) {
                 self.counts.clock_restarts += 1;
                 self.taken = None;
-                self.again = Again::default();
+                self.again.forget_stamps();
                 return None;
             }
             self.suspect = Some(stamp);
@@ -414,9 +435,13 @@ impl Synchronizer {
         self.calls.pop_front()
     }
 
-    /// The newest odometry, which the filter may not have got yet.
+    /// The newest odometry, which the filter may not have got yet; `None` while it has to hear
+    /// first that odometry begins anew.
     #[must_use]
     pub fn newest_odometry(&self) -> Option<(Stamp, Pose2)> {
+        if self.calls.iter().any(|call| matches!(call, Call::BeginOdometry(_))) {
+            return None;
+        }
         let newest = self.odometry.newest()?;
         Some((newest, self.odometry.at(newest).ok()?))
     }

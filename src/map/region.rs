@@ -1,6 +1,8 @@
 //! A part of the map, or the whole, in coarser cells.
 
-use serde::Serialize;
+use std::io;
+
+use serde::{Serialize, Serializer};
 use thiserror::Error;
 
 use super::tiles::Extent;
@@ -9,7 +11,7 @@ use crate::slam::grid::occupancy::{Count, OccupancyGrid, OccupancyMap, OccupiedT
 use crate::slam::grid::tile_map::{TILE_SIZE, TileKey, TileMap};
 use crate::slam::pose::Point2;
 
-/// Cells that a region may have.
+/// Cells that a region may have; a layer has four bytes for each while it is made.
 pub const MOST_CELLS: u64 = 1 << 24;
 
 /// How far, in cells, a corner may be beside the edge between two cells and still be on it.
@@ -59,6 +61,25 @@ pub enum RegionError {
         /// Metres a cell.
         resolution: f64,
     },
+    /// An answer with a byte a cell would be too large.
+    #[error(
+        "the region has {cells} cells in {layers} layers, and max_reply_bytes allows {most} in \
+         all; ask for a smaller one, or for a larger res"
+    )]
+    TooMuch {
+        /// Its cells.
+        cells: usize,
+        /// Layers that are asked for.
+        layers: usize,
+        /// Bytes of an answer.
+        most: usize,
+    },
+    /// Written down, it is too long.
+    #[error(
+        "the region takes more than {0} bytes, which max_reply_bytes allows; ask for a smaller \
+         one, or for a larger res"
+    )]
+    TooLong(usize),
 }
 
 /// When cells were seen last: whole seconds of stamps, and one more; 0 is never.
@@ -155,44 +176,41 @@ impl Region {
         }
     }
 
-    fn layer(&self, layer: Layer, known: Option<Known<'_>>) -> Vec<i64> {
-        let map = known.map(|known| known.map);
-        let counted = |value: fn(Count) -> u32| {
-            let value = |count: Count| (count.visits > 0).then(|| value(count).into());
-            self.maxima(map.map(OccupancyMap::counts), 0, value)
-        };
-        match layer {
-            Layer::Occupancy => {
-                let threshold = known.map_or(OccupiedThreshold::of_share(0.0), |of| of.threshold);
-                self.occupancy(map, threshold).cells.into_iter().map(i64::from).collect()
-            }
-            Layer::Hits => counted(|count| count.hits),
-            Layer::Visits => counted(|count| count.visits),
-            Layer::LastSeen => {
-                let seconds = |seen: u32| (seen > 0).then(|| i64::from(seen) - 1);
-                self.maxima(known.map(|known| known.last_seen), -1, seconds)
-            }
-        }
+    /// Looks whether an answer of so many bytes has one for each cell of each layer.
+    ///
+    /// # Errors
+    /// When it has not.
+    pub fn check_size(&self, layers: usize, most: usize) -> Result<(), RegionError> {
+        let cells = self.extent.width as usize * self.extent.height as usize;
+        let fits = cells.saturating_mul(layers) <= most;
+        if fits { Ok(()) } else { Err(RegionError::TooMuch { cells, layers, most }) }
     }
 
-    /// Layers as JSON: size and place as in the JSON of a map, and in `layers` the runs of each,
-    /// the largest value of the merged cells in each.
-    #[must_use]
-    pub fn json(&self, layers: &[Layer], known: Option<Known<'_>>) -> String {
+    /// Layers as JSON of at most so many bytes: size and place as in the JSON of a map, and in
+    /// `layers` the runs of each, the largest value of the merged cells in each.
+    ///
+    /// # Errors
+    /// When that has more bytes.
+    pub fn json(
+        &self,
+        layers: &[Layer],
+        known: Option<Known<'_>>,
+        most: usize,
+    ) -> Result<Vec<u8>, RegionError> {
         let corner = |i: i32| f64::from(i) * self.resolution;
-        let runs = layers.iter().map(|&layer| {
-            let cells = self.layer(layer, known);
-            let runs = cells.chunk_by(|a, b| a == b).map(|run| (run[0], run.len()));
-            (layer.name().to_owned(), serde_json::json!(runs.collect::<Vec<_>>()))
-        });
         let layers = Layers {
             resolution: self.resolution,
             width: self.extent.width,
             height: self.extent.height,
             origin: [corner(self.extent.ix), corner(self.extent.iy)],
-            layers: runs.collect(),
+            layers: Runs { region: self, layers, known },
         };
-        serde_json::to_string(&layers).expect("memory takes every write, and every key is a string")
+        let mut text = Bounded { bytes: Vec::new(), most };
+        // Memory takes every write, and every key is a string.
+        match serde_json::to_writer(&mut text, &layers) {
+            Ok(()) => Ok(text.bytes),
+            Err(_) => Err(RegionError::TooLong(most)),
+        }
     }
 
     /// The largest value of the known cells that each cell of the region covers.
@@ -235,12 +253,94 @@ impl Region {
 }
 
 #[derive(Serialize)]
-struct Layers {
+struct Layers<'a> {
     resolution: f64,
     width: u32,
     height: u32,
     origin: [f64; 2],
-    layers: serde_json::Map<String, serde_json::Value>,
+    layers: Runs<'a>,
+}
+
+/// Layers by their names, each made as it is written: there is one in memory at a time.
+struct Runs<'a> {
+    region: &'a Region,
+    layers: &'a [Layer],
+    known: Option<Known<'a>>,
+}
+
+impl Serialize for Runs<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut layers = self.layers.to_vec();
+        layers.sort_unstable_by_key(|layer| layer.name());
+        serializer.collect_map(layers.into_iter().map(|layer| (layer.name(), self.cells(layer))))
+    }
+}
+
+impl Runs<'_> {
+    fn cells(&self, layer: Layer) -> Cells {
+        let Self { region, known, .. } = *self;
+        let map = known.map(|known| known.map);
+        let counted = |value: fn(Count) -> u32| {
+            let value = |count: Count| (count.visits > 0).then(|| value(count));
+            Cells::Counts(region.maxima(map.map(OccupancyMap::counts), 0, value))
+        };
+        match layer {
+            Layer::Occupancy => {
+                let threshold = known.map_or(OccupiedThreshold::of_share(0.0), |of| of.threshold);
+                Cells::Occupancy(region.occupancy(map, threshold).cells)
+            }
+            Layer::Hits => counted(|count| count.hits),
+            Layer::Visits => counted(|count| count.visits),
+            Layer::LastSeen => {
+                Cells::Seconds(region.maxima(known.map(|known| known.last_seen), 0, Some))
+            }
+        }
+    }
+}
+
+/// The cells of a layer, written as runs of a value and a count.
+enum Cells {
+    Occupancy(Vec<i8>),
+    Counts(Vec<u32>),
+    /// As in [`LastSeen`].
+    Seconds(Vec<u32>),
+}
+
+impl Serialize for Cells {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::Occupancy(cells) => serializer.collect_seq(runs(cells, i64::from)),
+            Self::Counts(cells) => serializer.collect_seq(runs(cells, i64::from)),
+            Self::Seconds(cells) => serializer.collect_seq(runs(cells, |seen| i64::from(seen) - 1)),
+        }
+    }
+}
+
+fn runs<T: Copy + PartialEq>(
+    cells: &[T],
+    value: impl Fn(T) -> i64,
+) -> impl Iterator<Item = (i64, usize)> {
+    cells.chunk_by(|a, b| a == b).map(move |run| (value(run[0]), run.len()))
+}
+
+/// Text that does not grow beyond a number of bytes.
+struct Bounded {
+    bytes: Vec<u8>,
+    most: usize,
+}
+
+impl io::Write for Bounded {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.bytes.len() + bytes.len() > self.most {
+            return Err(io::ErrorKind::FileTooLarge.into());
+        }
+        self.bytes.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -319,14 +419,17 @@ mod tests {
         *last_seen.get_mut(Cell::new(20, 0)) = 8;
         *last_seen.get_mut(Cell::new(21, 1)) = 5;
         let known = |map| Some(Known { map, threshold: THRESHOLD, last_seen: &last_seen });
-        let text = region.json(&[Layer::Hits, Layer::Visits, Layer::LastSeen], known(&map));
+        let json = |layers: &[Layer], known| {
+            String::from_utf8(region.json(layers, known, 1000).unwrap()).unwrap()
+        };
+        let text = json(&[Layer::Hits, Layer::Visits, Layer::LastSeen], known(&map));
         assert_eq!(
             text,
             r#"{"resolution":0.2,"width":1,"height":1,"origin":[2.0,0.0],"layers":{"hits":[[3,1]],"last_seen":[[7,1]],"visits":[[3,1]]}}"#
         );
-        let text = region.json(&[Layer::Hits], known(&clone));
+        let text = json(&[Layer::Hits], known(&clone));
         assert!(text.ends_with(r#""layers":{"hits":[[1,1]]}}"#), "{text}");
-        let text = region.json(&[Layer::Occupancy, Layer::LastSeen], None);
+        let text = json(&[Layer::Occupancy, Layer::LastSeen], None);
         assert!(
             text.ends_with(r#""layers":{"last_seen":[[-1,1]],"occupancy":[[-1,1]]}}"#),
             "{text}"
@@ -341,6 +444,15 @@ mod tests {
         let large = window([-1e6, -1e6], [1e6, 1e6]);
         let error = Region::new(large, 0.1, FINE).unwrap_err().to_string();
         assert!(error.starts_with("the region has 20000000 by 20000000 cells of 0.1 m"), "{error}");
+        let region = Region::new(small, 0.1, FINE).unwrap();
+        assert_eq!(region.check_size(2, 200), Ok(()));
+        let error = region.check_size(2, 199).unwrap_err().to_string();
+        let told = "the region has 100 cells in 2 layers, and max_reply_bytes allows 199 in all";
+        assert!(error.starts_with(told), "{error}");
+        let whole = region.json(&[Layer::Hits], None, 1000).unwrap();
+        assert_eq!(region.json(&[Layer::Hits], None, whole.len()), Ok(whole.clone()));
+        let error = region.json(&[Layer::Hits], None, whole.len() - 1).unwrap_err();
+        assert_eq!(error, RegionError::TooLong(whole.len() - 1));
         let coarse = Region::new(large, 1e4, FINE).unwrap();
         assert_eq!(coarse.occupancy(Some(&map()), THRESHOLD).cells.iter().max(), Some(&100));
     }

@@ -123,6 +123,8 @@ impl Synchronized {
                 self.ready.push_back(Event::Reading(reading));
             }
             Call::Refuse(refusal) => self.ready.push_back(Event::Refused(refusal)),
+            // A recording has no restart.
+            Call::BeginOdometry(_) => {}
         }
     }
 

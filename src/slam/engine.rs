@@ -172,6 +172,36 @@ impl Engine {
         }
     }
 
+    /// Forgets where the base is in `map`: its place is searched for there, until a scan fits
+    /// there and nowhere else. Where poses are given, this has no effect.
+    pub fn search_pose(&mut self) {
+        match self {
+            Self::GMapping(filter) => filter.search_pose(),
+            Self::Hector(hector) => hector.search_pose(),
+            Self::KnownPoses(_) => {}
+        }
+    }
+
+    /// Whether nobody knows where the base is in the map so far.
+    #[must_use]
+    pub const fn is_searching(&self) -> bool {
+        match self {
+            Self::GMapping(filter) => filter.is_searching(),
+            Self::Hector(hector) => hector.is_searching(),
+            Self::KnownPoses(_) => false,
+        }
+    }
+
+    /// Forgets where odometry has the base: the next reading begins anew, and is no motion. Where
+    /// poses are given, this has no effect.
+    pub const fn forget_odometry(&mut self) {
+        match self {
+            Self::GMapping(filter) => filter.forget_odometry(),
+            Self::Hector(hector) => hector.forget_odometry(),
+            Self::KnownPoses(_) => {}
+        }
+    }
+
     /// Takes an odometry reading: the base in `odom`.
     pub fn add_odometry(&mut self, odom_from_base: Pose2) -> OdometryUpdate {
         match self {

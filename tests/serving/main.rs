@@ -623,6 +623,11 @@ async fn commands_that_are_switched_off_or_too_many_and_answers_too_large_are_re
     let refused = rig.ask("map").await.unwrap_err();
     assert!(refused.contains("max_reply_bytes allows 1000; ask for a part"), "{refused}");
     assert!(rig.ask("map?bbox=-0.5,-0.5,0.5,0.5").await.is_ok());
+    let refused = rig.ask("map?bbox=-1,-1,1,1;layers=hits,visits").await.unwrap_err();
+    assert!(
+        refused.contains("1600 cells in 2 layers, and max_reply_bytes allows 1000"),
+        "{refused}"
+    );
 
     let mut saves = JoinSet::new();
     for _ in 0..6 {

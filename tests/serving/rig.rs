@@ -128,6 +128,7 @@ fn status() -> Status {
         filter: FilterStatus::default(),
         map: None,
         checkpoint: None,
+        refused: BTreeMap::new(),
         peak_memory_bytes: None,
         seed: 1,
     }
@@ -186,6 +187,7 @@ impl Rig {
             verdicts: heard,
             commands: commander,
             status: AskStatus::new(status),
+            refusals: Arc::default(),
         };
         let prefix = Prefix::parse(ROBOT).expect("it is a key");
         let node = RosNode::new(daemon.zid().to_string(), prefix, Convention::Bridge);

@@ -6,10 +6,12 @@ use serde::{Deserialize, Serialize};
 
 use super::{Gauges, Mapper, View};
 use crate::clock;
+use crate::config::InitialPose;
 use crate::daemon::frames::FramesState;
 use crate::daemon::ledger::Ledger;
 use crate::daemon::snapshot::Estimate;
 use crate::daemon::synchronizer::state::SynchronizerState;
+use crate::slam::known_map::Mode;
 use crate::slam::path::Path;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::state::{EngineState, StateError, ensure};
@@ -111,11 +113,47 @@ impl Mapper {
         Ok(())
     }
 
+    /// Takes the robot to be where the configuration says, if it does, and not where the state has
+    /// it; or searches for its place in the map. Odometry begins anew where it was carried to, and
+    /// until then no pose is told.
+    pub fn take_configured_pose(&mut self) {
+        let Some(initial_pose) = self.initial_pose else { return };
+        self.engine.forget_odometry();
+        self.synchronizer.forget_odometry();
+        self.view.odom_from_base = None;
+        self.view.estimate.stamp = None;
+        match initial_pose {
+            InitialPose::At([x, y, yaw]) => {
+                let (done, _) = self.set_pose(Pose2::new(x, y, yaw));
+                tracing::info!("initial_pose is another than before: {done}");
+            }
+            InitialPose::Search(_) => {
+                tracing::info!("the robot's place in the map is searched for");
+                self.search_pose();
+            }
+        }
+        self.publish();
+    }
+
+    /// Searches for the robot's place in the map; until it is found, no pose is told.
+    pub fn search_pose(&mut self) {
+        self.engine.search_pose();
+        self.view.estimate.particles = Arc::new([]);
+        self.renew_estimate(None);
+        self.publish();
+    }
+
     /// Maps or localizes as the configuration says, and not as the state did.
     pub fn take_configured_mode(&mut self) {
-        self.set_mode(self.first_mode);
+        self.engine.set_mode(self.first_mode);
+        self.view.mode = self.engine.mode();
         self.view.changed = true;
         self.publish();
+    }
+
+    /// Whether it is to localize, and there is no map to do so in.
+    pub fn localizes_in_nothing(&mut self) -> bool {
+        self.engine.mode() == Mode::Localization && !self.knows_a_map()
     }
 }
 

@@ -5,13 +5,20 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Call, Channel, FramedScan, ScanCounts, Synchronizer, Waiting};
-use crate::slam::pose::Stamp;
+use super::{Call, Channel, FramedScan, ScanCounts, Sought, Synchronizer, Waiting};
+use crate::daemon::ledger::Verdict;
+use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::state::{StateError, ensure};
 use crate::timeline::OdometryBuffer;
 
 /// Stamps of scans that are known again when they come after a restart: minutes at any rate.
 pub(super) const KNOWN_AGAIN: usize = 16_384;
+
+/// A robot whose power was cut sends odometry again after more than this, s.
+const POWER_CUT_S: f64 = 5.0;
+
+/// Odometry that has just begun has the base within this distance of its origin, m.
+const NEAR_ORIGIN_M: f64 = 0.5;
 
 /// All that has come and may still matter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,6 +46,8 @@ pub(super) struct Again {
     scans_until: Option<Stamp>,
     /// Likewise of odometry.
     odometry_until: Option<Stamp>,
+    /// Where odometry had the base before the restart, until it tells more.
+    odometry_before: Option<Pose2>,
     /// Whether a scan came whose stamp is known.
     recognised: bool,
 }
@@ -55,6 +64,20 @@ impl Again {
         self.recognised
     }
 
+    /// The clock was set back: no stamp is known any more.
+    pub(super) fn forget_stamps(&mut self) {
+        *self = Self { odometry_before: self.odometry_before, ..Self::default() };
+    }
+
+    /// Whether the first odometry after the restart has another origin, as after a power cut: it
+    /// is near its origin, and was not. One that came after a `pause` of so many seconds only may
+    /// have, for no robot starts sooner; without stamps to compare, `pause` is infinite.
+    pub(super) fn odometry_begins_anew(&mut self, odom_from_base: Pose2, pause: f64) -> bool {
+        let near = |pose: Pose2| pose.position().norm() <= NEAR_ORIGIN_M;
+        let before = self.odometry_before.take().filter(|_| pause > POWER_CUT_S);
+        before.is_some_and(|before| near(odom_from_base) && !near(before))
+    }
+
     /// Whether odometry is not newer than what came before the restart.
     pub(super) fn knows_odometry(&mut self, stamp: Stamp) -> bool {
         let known = self.odometry_until.is_some_and(|until| stamp <= until);
@@ -66,6 +89,30 @@ impl Again {
 }
 
 impl Synchronizer {
+    /// Given poses have no origin to begin at.
+    fn odometry_before(&self, state: &SynchronizerState) -> Option<Pose2> {
+        let newest = state.odometry.newest().filter(|_| self.settings.sought == Sought::Odometry);
+        state.odometry.at(newest?).ok()
+    }
+
+    /// Forgets all odometry, for the robot was carried, and refuses the scans from before that.
+    pub fn forget_odometry(&mut self) {
+        self.odometry.clear();
+        self.again.odometry_before = None;
+        let mut stamps = Vec::new();
+        self.calls.retain(|call| {
+            if let Call::Scan(ready) = call {
+                stamps.push(ready.scan.stamp);
+            }
+            matches!(call, Call::Refuse(_))
+        });
+        stamps.extend(self.waiting.drain(..).map(|waiting| waiting.stamp()));
+        for stamp in stamps {
+            let detail = "it is from before the robot was carried".to_owned();
+            self.refuse(stamp, Verdict::Late, detail);
+        }
+    }
+
     /// All that has come and may still matter.
     #[must_use]
     pub fn state(&self) -> SynchronizerState {
@@ -89,6 +136,7 @@ impl Synchronizer {
         self.again = Again {
             scans_until: state.taken,
             odometry_until: state.odometry.newest(),
+            odometry_before: self.odometry_before(&state),
             recognised: false,
         };
         self.odometry = state.odometry;
@@ -114,7 +162,7 @@ impl SynchronizerState {
         ensure(self.odometry.is_sound(), "odometry")?;
         let called = self.calls.iter().filter_map(|call| match call {
             Call::Scan(ready) => Some(&ready.scan),
-            Call::Odometry(..) | Call::Refuse(_) => None,
+            Call::Odometry(..) | Call::Refuse(_) | Call::BeginOdometry(_) => None,
         });
         let waiting = self.waiting.iter().map(|(framed, _)| &framed.scan);
         ensure(called.chain(waiting).all(|scan| scan.geometry.is_usable()), "scans")?;

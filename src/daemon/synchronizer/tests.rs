@@ -84,6 +84,7 @@ impl Rig {
                 let after = refusal.stamp.unwrap().seconds_since(stamp(0)) * 1e3;
                 format!("{:?}{after:.0}", refusal.verdict)
             }
+            Call::BeginOdometry(pose) => format!("begin{}", pose.x),
         };
         self.calls().into_iter().map(told).collect()
     }
@@ -91,7 +92,7 @@ impl Rig {
     fn details(&mut self) -> Vec<String> {
         let detail = |call| match call {
             Call::Refuse(refusal) => Some(refusal.detail),
-            Call::Odometry(..) | Call::Scan(_) => None,
+            Call::Odometry(..) | Call::Scan(_) | Call::BeginOdometry(_) => None,
         };
         self.calls().into_iter().filter_map(detail).collect()
     }
@@ -551,4 +552,31 @@ fn a_clock_that_was_set_back_at_the_restart_is_none_that_feeds_again() {
     assert_eq!(rig.synchronizer.odometry_counts().restarts, 1);
     let told = rig.told();
     assert!(told.iter().filter(|told| told.starts_with('s')).count() > 15, "{told:?}");
+}
+
+#[test]
+fn odometry_begins_anew_only_near_its_origin_after_a_pause_away_from_it() {
+    // When it comes after the restart, in ms, and where it has the base then and before, m.
+    let begins = |pause: i64, before: f64, after: f64| {
+        let mut rig = Rig::new(settings());
+        let give = |rig: &mut Rig, milliseconds: i64, x: f64| {
+            let sample = (stamp(milliseconds), Pose2::new(x, 0.0, 0.0));
+            rig.synchronizer.odometry(Channel::Messages, sample, &rig.frames);
+        };
+        give(&mut rig, 0, before);
+        let mut rig = restarted(&rig);
+        give(&mut rig, pause, after);
+        let begins = rig.synchronizer.newest_odometry().is_none();
+        rig.scan(pause);
+        let told = rig.told();
+        assert_eq!(told.last(), Some(&format!("s{after}")), "{told:?}");
+        assert_eq!(begins, told.contains(&format!("begin{after}")), "{told:?}");
+        give(&mut rig, pause + 20_000, 0.0);
+        assert!(!rig.told().contains(&"begin0".to_owned()), "only the first may");
+        begins
+    };
+    assert!(begins(5_100, 9.0, 0.3));
+    assert!(!begins(4_900, 9.0, 0.3), "no robot starts so soon");
+    assert!(!begins(5_100, 9.0, 0.7), "it is not near its origin");
+    assert!(!begins(5_100, 0.3, 0.1), "it was near its origin");
 }

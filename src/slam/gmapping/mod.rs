@@ -89,6 +89,8 @@ pub struct GMapping {
     scans_seen: usize,
     mode: Mode,
     beginning: Beginning,
+    /// The map in which the robot's place is searched for, while nobody knows where it is.
+    searched: Option<Arc<KnownMap>>,
 }
 
 /// What the filter begins with, beside its parameters.
@@ -98,7 +100,7 @@ struct Beginning {
     known: Option<Arc<KnownMap>>,
     /// The same as particles have it.
     map: ParticleMap,
-    /// Why the last scan could not be the first one.
+    /// Why the last scan was not localized.
     obstacle: Option<NotLocalized>,
 }
 
@@ -139,6 +141,7 @@ impl GMapping {
             scans_seen: 0,
             mode: Mode::Mapping,
             beginning: Beginning::default(),
+            searched: None,
             parameters,
         })
     }
@@ -167,7 +170,7 @@ impl GMapping {
         self.mode
     }
 
-    /// Why no scan could be the first one yet.
+    /// Why the last scan was not localized, until one is.
     #[must_use]
     pub const fn obstacle(&self) -> Option<&NotLocalized> {
         self.beginning.obstacle.as_ref()
@@ -197,6 +200,7 @@ impl GMapping {
         self.settled = Path::default();
         self.stamps.clear();
         self.scans_seen = 0;
+        self.searched = None;
         if let Some(known) = self.beginning.known.take() {
             self.begin_on(known);
         }
@@ -205,8 +209,9 @@ impl GMapping {
     /// Says where the base is in `map`: before the first scan, where the map begins; later, all
     /// particles are moved and turned together, so that the best one's pose is this one.
     ///
-    /// Maps and trajectories stay where they are.
+    /// Maps and trajectories stay where they are. A search for the pose ends.
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
+        self.searched = None;
         if self.particles.is_empty() {
             self.parameters.initial_pose = Some(pose_in_map);
             return;
@@ -215,6 +220,29 @@ impl GMapping {
         for particle in &mut self.particles {
             particle.pose_in_map = moved * particle.pose_in_map;
         }
+    }
+
+    /// Forgets where the robot is: its place is searched for in the map, until a scan fits there.
+    ///
+    /// A place in the best particle's map is none in the others' maps, so all go on from that one.
+    /// Before the first scan there is only a known map to search, or none.
+    pub fn search_pose(&mut self) {
+        self.parameters.initial_pose = None;
+        self.unite();
+        let grid = self.occupancy_grid().filter(|_| !self.particles.is_empty());
+        let threshold = self.parameters.map.occupied_threshold;
+        self.searched = grid.map(|grid| Arc::new(KnownMap::new(grid, threshold)));
+    }
+
+    /// Whether nobody knows where the robot is in the map so far.
+    #[must_use]
+    pub const fn is_searching(&self) -> bool {
+        self.searched.is_some()
+    }
+
+    /// Forgets where odometry has the base: the next reading begins anew, and is no motion.
+    pub const fn forget_odometry(&mut self) {
+        self.odometry.odom_from_base = None;
     }
 
     /// Takes an odometry reading: the base in `odom`.
@@ -239,11 +267,10 @@ impl GMapping {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
-        if self.particles.is_empty()
-            && let Err(reason) = self.locate(&scan)
-        {
+        if let Err(reason) = self.locate(&scan) {
             return ScanUpdate::Skipped(reason);
         }
+        self.beginning.obstacle = None;
         self.stamps.push_back(reading.scan.stamp);
         let odom_from_base = reading.odom_from_base;
         // On one of the pool's threads, so that only the others have to be woken.
@@ -286,7 +313,8 @@ impl GMapping {
         if !self.scans_seen.is_multiple_of(self.parameters.throttle_scans.max(1)) {
             return Err(SkipReason::Throttled);
         }
-        let elapsed = self.stamps.back().map(|last| reading.scan.stamp.seconds_since(*last));
+        let last = self.stamps.back().filter(|_| !self.is_searching());
+        let elapsed = last.map(|last| reading.scan.stamp.seconds_since(*last));
         if !self.parameters.gate.opens(&self.odometry.since_processed, elapsed) {
             return Err(SkipReason::NotMovedEnough);
         }
@@ -294,14 +322,18 @@ impl GMapping {
         if scan.hits.is_empty() { Err(SkipReason::NoUsableBeams) } else { Ok(scan) }
     }
 
-    /// Searches the known map, if there is one, for where the first scan was taken.
+    /// Searches for where the scan was taken: in the known map if it is the first and no pose is
+    /// set, and in the map so far if the robot's place is searched for.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &self.beginning.known else { return Ok(()) };
-        if self.parameters.initial_pose.is_some() {
-            return Ok(());
-        }
+        let anywhere = self.particles.is_empty() && self.parameters.initial_pose.is_none();
+        let known = self.beginning.known.as_ref().filter(|_| anywhere);
+        let Some(known) = self.searched.as_ref().or(known) else { return Ok(()) };
         match known.find(&scan.outline, self.pool.as_deref()) {
-            Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
+            Ok(place) => {
+                // The way there says nothing any more.
+                self.odometry.since_processed = Motion::default();
+                self.set_pose(place.pose_in_map);
+            }
             Err(obstacle) => {
                 self.beginning.obstacle = Some(obstacle);
                 return Err(SkipReason::NotLocalized);
@@ -320,7 +352,6 @@ impl GMapping {
             if found.score > self.parameters.matcher.minimum_score {
                 pose = found.pose_in_map;
             }
-            self.beginning.obstacle = None;
         }
         let count = self.parameters.particles.max(1);
         let root = self.tree.append(None, pose);

@@ -102,6 +102,7 @@ impl GMapping {
         self.stamps = state.stamps;
         self.scans_seen = state.scans_seen;
         self.mode = state.mode;
+        self.searched = None;
         Ok(())
     }
 }

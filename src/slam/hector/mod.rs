@@ -40,7 +40,7 @@ use super::update::{OdometryUpdate, OnPhase, Phase, ScanReport, ScanUpdate, Skip
 /// How much of the usual score each scan renews.
 const RENEWAL: f64 = 0.1;
 
-/// How surely an initial pose in a known map is given or found: standard deviations, m and rad.
+/// How surely a pose in a known map is given or found: standard deviations, m and rad.
 const INITIAL: [f64; 2] = [0.1, 0.05];
 
 /// Without odometry, a scan enters the map in any case if more than this share of what it sees is
@@ -61,6 +61,8 @@ pub struct Hector {
     scans_seen: usize,
     mode: Mode,
     beginning: Beginning,
+    /// The map in which the robot's place is searched for, while nobody knows where it is.
+    searched: Option<Arc<KnownMap>>,
 }
 
 /// What the engine begins with, beside its parameters.
@@ -68,7 +70,7 @@ pub struct Hector {
 struct Beginning {
     /// The map that is known before the first scan.
     known: Option<Arc<KnownMap>>,
-    /// Why the last scan could not be the first one.
+    /// Why the last scan was not localized.
     obstacle: Option<NotLocalized>,
 }
 
@@ -108,6 +110,7 @@ impl Hector {
             scans_seen: 0,
             mode: Mode::Mapping,
             beginning: Beginning::default(),
+            searched: None,
             parameters,
         }
     }
@@ -131,7 +134,7 @@ impl Hector {
         self.mode
     }
 
-    /// Why no scan could be the first one yet.
+    /// Why the last scan was not localized, until one is.
     #[must_use]
     pub const fn obstacle(&self) -> Option<&NotLocalized> {
         self.beginning.obstacle.as_ref()
@@ -147,15 +150,36 @@ impl Hector {
     }
 
     /// Says where the base is in `map`: before the first scan, where the map begins; later, the
-    /// robot is there, and the map stays where it is.
+    /// robot is there, and the map stays where it is. A search for the pose ends.
     pub fn set_pose(&mut self, pose_in_map: Pose2) {
+        self.searched = None;
         let Some(state) = &mut self.state else {
             self.parameters.initial_pose = Some(pose_in_map);
             return;
         };
-        *state = State { pose_in_map, velocity: None, ..*state };
+        let Prediction { covariance, .. } = Prediction::within(pose_in_map, INITIAL);
+        *state = State { pose_in_map, covariance, velocity: None, ..*state };
         self.odometry.since_processed = Motion::default();
         self.odometry.anchor(pose_in_map);
+    }
+
+    /// Forgets where the robot is: its place is searched for in the map, until a scan fits there.
+    /// Before the first scan there is only a known map to search, or none.
+    pub fn search_pose(&mut self) {
+        self.parameters.initial_pose = None;
+        let grid = self.occupancy().to_grid(OCCUPIED_THRESHOLD).filter(|_| self.state.is_some());
+        self.searched = grid.map(|grid| Arc::new(KnownMap::new(grid, OCCUPIED_THRESHOLD)));
+    }
+
+    /// Whether nobody knows where the robot is in the map so far.
+    #[must_use]
+    pub const fn is_searching(&self) -> bool {
+        self.searched.is_some()
+    }
+
+    /// Forgets where odometry has the base: the next reading begins anew, and is no motion.
+    pub const fn forget_odometry(&mut self) {
+        self.odometry.odom_from_base = None;
     }
 
     /// Takes an odometry reading: the base in `odom`.
@@ -182,9 +206,7 @@ impl Hector {
             Ok(scan) => scan,
             Err(reason) => return ScanUpdate::Skipped(reason),
         };
-        if self.state.is_none()
-            && let Err(reason) = self.locate(&scan)
-        {
+        if let Err(reason) = self.locate(&scan) {
             return ScanUpdate::Skipped(reason);
         }
         let placed = self.place(&scan, sweep);
@@ -250,12 +272,14 @@ impl Hector {
         matcher::place(&self.pyramid, scan, &prediction, state.usual_score)
     }
 
-    /// Searches the known map, if there is one, for where the first scan was taken.
+    /// Searches for where the scan was taken: in the known map if it is the first and no pose is
+    /// set, and in the map so far if the robot's place is searched for.
     fn locate(&mut self, scan: &PreparedScan) -> Result<(), SkipReason> {
-        let Some(known) = &self.beginning.known else { return Ok(()) };
-        if self.parameters.initial_pose.is_none() {
+        let anywhere = self.state.is_none() && self.parameters.initial_pose.is_none();
+        let known = self.beginning.known.as_ref().filter(|_| anywhere);
+        if let Some(known) = self.searched.as_ref().or(known) {
             match known.find(&scan.outline, None) {
-                Ok(place) => self.parameters.initial_pose = Some(place.pose_in_map),
+                Ok(place) => self.set_pose(place.pose_in_map),
                 Err(obstacle) => {
                     self.beginning.obstacle = Some(obstacle);
                     return Err(SkipReason::NotLocalized);

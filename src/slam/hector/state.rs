@@ -60,6 +60,7 @@ impl Hector {
         self.path = state.path;
         self.scans_seen = state.scans_seen;
         self.mode = state.mode;
+        self.searched = None;
         Ok(())
     }
 }
