@@ -1,7 +1,8 @@
 //! The real daemon, killed and started again: it goes on where it was, byte for byte.
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -602,6 +603,108 @@ async fn what_cannot_be_written_is_told_and_mapping_goes_on() {
 
     let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
     assert_eq!(robot.status().await["checkpoint"]["resumed_from"], last);
+    daemon.terminate(&robot).await;
+}
+
+/// A small disk, which only programs that were started on it see.
+struct SmallDisk {
+    holder: Child,
+    mounted_on: PathBuf,
+}
+
+impl SmallDisk {
+    /// `None` without the rights to have one.
+    fn new(directory: &Path) -> Option<Self> {
+        fs::create_dir_all(directory).unwrap();
+        let script = r#"mount -t tmpfs -o size=2M tmpfs "$0" && echo mounted && exec sleep 1000"#;
+        let mut holder = Command::new("unshare")
+            .args(["--mount", "sh", "-c", script])
+            .arg(directory)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(holder.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let disk = Self { holder, mounted_on: directory.to_owned() };
+        let is_root = Command::new("id").arg("-u").output().unwrap().stdout == b"0\n";
+        let must = is_root && std::env::var_os("GMAPD_CI").is_some();
+        assert!(line == "mounted\n" || !must, "root can mount no disk");
+        (line == "mounted\n").then_some(disk)
+    }
+
+    /// Runs a command where the disk is.
+    fn command(&self, words: &[&str]) -> Command {
+        let mut command = Command::new("nsenter");
+        command.args(["--mount", "--target", &self.holder.id().to_string()]).args(words);
+        command
+    }
+
+    /// What is on it, as it is seen from outside.
+    fn path(&self) -> PathBuf {
+        let root = PathBuf::from(format!("/proc/{}/root", self.holder.id()));
+        root.join(self.mounted_on.strip_prefix("/").unwrap())
+    }
+
+    /// The bytes of each checkpoint.
+    fn files(&self) -> Vec<(u64, Vec<u8>)> {
+        let files = checkpoints(&self.path()).into_iter();
+        files.map(|(number, path)| (number, fs::read(path).unwrap())).collect()
+    }
+
+    /// Until nothing goes on it any more.
+    fn fill(&self) {
+        let mut file = File::create(self.path().join("filler")).unwrap();
+        while file.write_all(&[7; 4096]).is_ok() {}
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        self.holder.kill().ok();
+        self.holder.wait().ok();
+    }
+}
+
+/// Feeds scans to a daemon that cannot write; what is on the disk stays as it is.
+async fn goes_on_without_writing(robot: &Robot, moments: &[Moment], disk: &SmallDisk, why: &str) {
+    let before = disk.files();
+    let verdicts = robot.feed_all(moments).await;
+    assert!(verdicts.iter().any(|verdict| verdict == "processed"), "{verdicts:?}");
+    let status = robot.until_checkpoint(|status| status["error"] != Value::Null).await;
+    assert!(status["error"].as_str().unwrap().contains(why), "{status}");
+    assert!(!before.is_empty() && disk.files() == before, "files are others than before");
+    assert_eq!(unfinished(&disk.path()), 0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn on_a_full_or_read_only_disk_mapping_goes_on_and_what_is_there_stays() {
+    let mesh = Mesh::new().await;
+    let Some(disk) = SmallDisk::new(&mesh.state("robot01")) else {
+        return eprintln!("skipped: only root can mount a small disk");
+    };
+    let moments = drive(120);
+    let robot = mesh.robot("robot01").await;
+    let gmapd = || disk.command(&[env!("CARGO_BIN_EXE_gmapd")]);
+    let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
+    robot.until(Daemons::One).await;
+    robot.feed_all(&moments[..20]).await;
+    robot.until_checkpoint(|status| status["last"]["scans"] == 20).await;
+    disk.fill();
+    goes_on_without_writing(&robot, &moments[20..50], &disk, "No space left on device").await;
+    fs::remove_file(disk.path().join("filler")).unwrap();
+    robot.feed_all(&moments[50..60]).await;
+    let status = robot.until_checkpoint(|status| status["last"]["scans"] == 60).await;
+    assert_eq!(status["error"], Value::Null);
+    daemon.kill(&robot).await;
+
+    let mut remount = disk.command(&["mount", "-o", "remount,ro"]);
+    assert!(remount.arg(&disk.mounted_on).status().unwrap().success());
+    let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
+    robot.until(Daemons::One).await;
+    let checkpoint = robot.status().await["checkpoint"].take();
+    assert_eq!(checkpoint["resumed_from"], status["last"]["file"]);
+    assert_eq!(checkpoint["resumed_stamp"], moments[59].stamp);
+    goes_on_without_writing(&robot, &moments[60..], &disk, "Read-only file system").await;
     daemon.terminate(&robot).await;
 }
 
