@@ -66,7 +66,7 @@ mod tests {
     fn one_that_is_late_makes_no_gap_and_a_clock_that_is_set_back_neither() {
         assert_eq!(gaps(&[5000, 5100, 1000, 5200]), (0, 0.0));
         assert_eq!(gaps(&[5000, 5100, 1000, 1100, 1200]), (0, 0.0));
-        assert_eq!(gaps(&[5000, 1000, 1100, 5000]), (1, 3.9));
+        assert_eq!(gaps(&[5000, 1000, 1100, 5100]), (1, 4.0));
         assert_eq!(gaps(&[0, i64::MAX / 1_000_000, i64::MIN / 1_000_000]).0, 1);
     }
 }
