@@ -1,8 +1,10 @@
 //! Networks and clocks fail: the daemon goes on by itself, and its counters have the outage.
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::path::PathBuf;
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::thread;
 use std::time::Duration;
 
 use gmapd::logs::Reading;
@@ -23,9 +25,14 @@ use zenoh::qos::CongestionControl;
 /// How long anything may take on a machine that does other things as well.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Who hears nothing for a second is taken for gone, and is tried again soon.
-const IMPATIENT: &str = "transport: { link: { tx: { lease: 1000, keep_alive: 4 } } },
-    scouting: { multicast: { enabled: false }, gossip: { enabled: false } },";
+/// Who hears nothing for so long is taken for gone, ms; and is tried again soon.
+const LEASE: u32 = 1000;
+
+/// Scans that are lost in an outage.
+const OUTAGE: usize = 20;
+
+/// From the last scan before it to the first after it.
+const LOST_S: f64 = 2.1;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Condition {
@@ -93,15 +100,28 @@ async fn carry(
     }
 }
 
-async fn open(mode: &str, rest: &str) -> Session {
-    let text = format!("{{ mode: {mode:?}, {IMPATIENT} {rest} }}");
-    zenoh::open(zenoh::Config::from_json5(&text).unwrap()).await.unwrap()
+fn configuration(mode: &str, lease: u32, rest: &str) -> String {
+    format!(
+        "{{ mode: {mode:?}, transport: {{ link: {{ tx: {{ lease: {lease}, keep_alive: 4 }} }} }},
+         scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }}, {rest} }}"
+    )
+}
+
+fn connect_to(endpoint: &str) -> String {
+    format!(
+        "connect: {{ endpoints: [{endpoint:?}], timeout_ms: -1,
+         retry: {{ period_init_ms: 50, period_max_ms: 200 }} }}"
+    )
+}
+
+async fn open(configuration: &str) -> Session {
+    zenoh::open(zenoh::Config::from_json5(configuration).unwrap()).await.unwrap()
 }
 
 /// A router; port 0 is any.
-async fn router(port: u16) -> (Session, u16) {
+async fn router(port: u16, lease: u32) -> (Session, u16) {
     let listen = format!("listen: {{ endpoints: [\"tcp/127.0.0.1:{port}\"] }}");
-    let session = open("router", &listen).await;
+    let session = open(&configuration("router", lease, &listen)).await;
     let locator = session.info().locators().await[0].to_string();
     (session, locator.rsplit(':').next().unwrap().parse().unwrap())
 }
@@ -128,6 +148,15 @@ enum Heard {
     No,
 }
 
+/// Between the program and the router.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Link {
+    /// The wire.
+    Wire,
+    /// One that loses a tenth of its packets, and delays the others by 20 ms.
+    Lossy,
+}
+
 struct Program(Child);
 
 impl Drop for Program {
@@ -137,35 +166,57 @@ impl Drop for Program {
     }
 }
 
-fn program(configuration: &PathBuf) -> Program {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gmapd"));
+/// Runs the program after these words.
+fn program(before: &[String], configuration: &PathBuf) -> Program {
+    let words = [before, &[env!("CARGO_BIN_EXE_gmapd").to_owned()]].concat();
+    let mut command = Command::new(&words[0]);
+    command.args(&words[1..]);
     command.args(["run", "--prefix", "robot01", "--zenoh"]).arg(configuration);
     for set in ["particles=6", "linearUpdate=0.2", "laser={x: 0.0}"] {
         command.args(["--set", set]);
     }
-    Program(command.stderr(Stdio::null()).spawn().unwrap())
+    Program(command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap())
+}
+
+/// What the script is called with that runs programs behind a lossy link to a port.
+fn lossy_link(port: u16) -> [String; 5] {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/lossy_link.py");
+    let script = script.to_str().unwrap().to_owned();
+    ["python3".to_owned(), script, port.to_string(), "0.1".to_owned(), "0.02".to_owned()]
+}
+
+/// Whether networks can be made here; where everything is tested, they must be.
+fn has_networks() -> bool {
+    let link = lossy_link(1);
+    let mut command = Command::new(&link[0]);
+    let status = command.args(&link[1..]).arg("true").status().unwrap();
+    let can = status.success();
+    let is_root = Command::new("id").arg("-u").output().unwrap().stdout == b"0\n";
+    let must = is_root && std::env::var_os("GMAPD_CI").is_some();
+    assert!(can || !must, "root can make no network: {status}");
+    can
 }
 
 impl Rig {
     async fn start() -> Self {
-        let (router, port) = router(0).await;
+        Self::start_behind(Link::Wire, LEASE).await
+    }
+
+    async fn start_behind(link: Link, lease: u32) -> Self {
+        let (router, port) = router(0, lease).await;
         let wire = Wire::to(port).await;
         let directory = tempfile::tempdir().unwrap();
-        let configuration = directory.path().join("zenoh.json5");
-        let text = format!(
-            "{{ mode: \"client\", {IMPATIENT} connect: {{ endpoints: [{:?}], timeout_ms: -1,
-             retry: {{ period_init_ms: 50, period_max_ms: 200 }} }} }}",
-            wire.endpoint
-        );
-        std::fs::write(&configuration, text).unwrap();
-        let near = format!(
-            "connect: {{ endpoints: [\"tcp/127.0.0.1:{port}\"], timeout_ms: -1,
-             retry: {{ period_init_ms: 50, period_max_ms: 200 }} }}"
-        );
-        let robot = open("client", &near).await;
+        let path = directory.path().join("zenoh.json5");
+        let (before, endpoint) = match link {
+            Link::Wire => (Vec::new(), wire.endpoint.as_str()),
+            Link::Lossy => (lossy_link(port).to_vec(), "tcp/10.77.0.1:7447"),
+        };
+        std::fs::write(&path, configuration("client", lease, &connect_to(endpoint))).unwrap();
+        let near = connect_to(&format!("tcp/127.0.0.1:{port}"));
+        let robot = open(&configuration("client", lease, &near)).await;
         let [scan, odom] = [publisher(&robot, "scan").await, publisher(&robot, "odom").await];
         let verdicts = verdicts(&robot).await;
-        let program = program(&configuration);
+        let program = program(&before, &path);
         let rig = Self {
             wire,
             port,
@@ -224,6 +275,16 @@ impl Rig {
         serde_json::from_slice(&reply.result().unwrap().payload().to_bytes()).unwrap()
     }
 
+    /// So many outages are in the counters of what comes with the scans, the longest this long.
+    async fn tells_of_outages(&self, count: u64, longest_s: f64) {
+        let inputs = self.status().await["inputs"].take();
+        for input in ["scan", "odom"] {
+            assert_eq!(inputs[input]["gaps"], count, "{inputs}");
+            let longest = inputs[input]["longest_gap_s"].as_f64().unwrap();
+            assert!((longest - longest_s).abs() < 0.01, "{inputs}");
+        }
+    }
+
     /// The daemon never ended, and its links ended so often.
     async fn ends(mut self, outages: u64) {
         assert!(self.map(30, 0).await > 0, "it does not map any more");
@@ -280,10 +341,12 @@ async fn a_connection_that_is_cut_comes_back() {
         assert!(rig.map(30, 0).await > 0);
         rig.wire.is(Condition::Cut);
         rig.heard(Heard::No).await;
-        rig.send(10, 0).await;
+        rig.send(OUTAGE, 0).await;
         rig.wire.is(Condition::Whole);
         rig.heard(Heard::Yes).await;
     }
+    assert!(rig.map(30, 0).await > 0);
+    rig.tells_of_outages(3, LOST_S).await;
     rig.ends(3).await;
 }
 
@@ -293,9 +356,11 @@ async fn a_network_that_is_silent_is_noticed_and_comes_back() {
     assert!(rig.map(30, 0).await > 0);
     rig.wire.is(Condition::Silent);
     rig.heard(Heard::No).await;
-    rig.send(10, 0).await;
+    rig.send(OUTAGE, 0).await;
     rig.wire.is(Condition::Whole);
     rig.heard(Heard::Yes).await;
+    assert!(rig.map(30, 0).await > 0);
+    rig.tells_of_outages(1, LOST_S).await;
     rig.ends(1).await;
 }
 
@@ -305,7 +370,7 @@ async fn a_router_that_restarts_is_found_again() {
     assert!(rig.map(30, 0).await > 0);
     rig.router.close().await.unwrap();
     rig.heard(Heard::No).await;
-    rig.router = router(rig.port).await.0;
+    rig.router = router(rig.port, LEASE).await.0;
     rig.heard(Heard::Yes).await;
     rig.ends(1).await;
 }
@@ -318,5 +383,34 @@ async fn a_clock_that_jumps_back_or_ahead_is_counted_and_mapping_goes_on() {
     assert!(rig.map(40, 3600).await > 0, "after a step ahead");
     let status = rig.status().await;
     assert_eq!(status["inputs"]["scan"]["clock_restarts"], 1, "{}", status["inputs"]);
+    // The last scan before the step ahead was 0.1 s before the first after it.
+    rig.tells_of_outages(1, 7200.1).await;
+    rig.ends(0).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn packets_that_are_lost_delay_scans_and_lose_none() {
+    if !has_networks() {
+        return eprintln!("skipped: only root can make a network that loses packets");
+    }
+    let mut rig = Rig::start_behind(Link::Lossy, 20_000).await;
+    let lines = BufReader::new(rig.program.0.stdout.take().unwrap()).lines();
+    let (lost, mut losses) = watch::channel(0);
+    let read = move || {
+        for line in lines.map_while(Result::ok) {
+            lost.send_replace(line.split(' ').next().unwrap().parse::<u64>().unwrap());
+        }
+    };
+    thread::Builder::new().name("losses".to_owned()).spawn(read).unwrap();
+    let (mut sent, before) = (0, *losses.borrow_and_update());
+    while *losses.borrow_and_update() < before + 30 {
+        assert!(rig.map(10, 0).await > 0, "after {sent} scans");
+        sent += 10;
+    }
+    println!("{} packets were lost while {sent} scans were sent", *losses.borrow() - before);
+    let status = rig.status().await;
+    let verdicts = status["scans"].as_object().unwrap().values();
+    assert_eq!(verdicts.filter_map(Value::as_u64).sum::<u64>(), sent, "{status}");
+    rig.tells_of_outages(0, 0.0).await;
     rig.ends(0).await;
 }

@@ -5,9 +5,11 @@
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+use gmapd::client::MapMirror;
 use gmapd::config::Config;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::limits::Reason;
@@ -85,22 +87,36 @@ fn make_certificates(directory: &Path, names: &[&str]) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
+/// A router, and how it is reached.
+async fn router(configuration: &str) -> (Session, String) {
+    let router = zenoh::open(zenoh::Config::from_json5(configuration).unwrap()).await.unwrap();
+    let locator = router.info().locators().await[0].to_string();
+    let port = locator.rsplit(':').next().unwrap();
+    let locator = format!("tls/localhost:{port}");
+    (router, locator)
+}
+
 impl Mesh {
     /// The router of `config/secure` or a folder in it, on a port of the loopback.
     async fn start(kind: &'static str) -> Self {
         let log = Log::start();
         let directory = tempfile::tempdir().unwrap();
-        let names = ["router", "robot01", "base", "reader"];
+        let names = ["router", "robot01", "robot02", "base", "reader"];
         make_certificates(&directory.path().join("certificates"), &names);
         make_certificates(&directory.path().join("strangers"), &["robot01"]);
         let users = secure().join("password/users.txt");
         std::fs::copy(users, directory.path().join("users.txt")).unwrap();
         let text = configuration(directory.path(), kind, "router.json5");
         let text = text.replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
-        let router = zenoh::open(zenoh::Config::from_json5(&text).unwrap()).await.unwrap();
-        let port = router.info().locators().await[0].to_string();
-        let port = port.rsplit(':').next().unwrap().to_owned();
-        Self { log, directory, kind, router, locator: format!("tls/localhost:{port}") }
+        let (router, locator) = router(&text).await;
+        Self { log, directory, kind, router, locator }
+    }
+
+    /// Another router, with somebody's certificate.
+    async fn router_with(&self, certificate: &str) -> (Session, String) {
+        let text = configuration(self.directory.path(), self.kind, "router.json5");
+        let text = text.replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
+        router(&text.replace("certificates/router", certificate)).await
     }
 
     /// How `who` connects; a stranger is refused at once.
@@ -155,6 +171,9 @@ impl Mesh {
         assert!(maps.len() == 1 && maps[0].contains("resolution"), "{maps:?}");
         impostor.undeclare().await.unwrap();
 
+        self.another_robot_is_out_of_reach(&robot).await;
+        self.who_looks_is_served(&reader).await;
+
         let paused = ask_until_answered(&base, "robot01/slam/cmd/pause").await;
         assert!(paused[0].contains("mapping is paused"), "{paused:?}");
         let mut verdicts = daemon.verdicts();
@@ -168,6 +187,73 @@ impl Mesh {
             session.close().await.unwrap();
         }
     }
+}
+
+/// A robot that is there already: what comes to it, and a command that it does.
+struct OtherRobot {
+    heard: Arc<AtomicUsize>,
+}
+
+impl OtherRobot {
+    /// The router says of itself what it likes, so it plays that robot.
+    async fn on(router: &Session) -> Self {
+        let heard = Arc::new(AtomicUsize::new(0));
+        let counter = Arc::clone(&heard);
+        let hear = move |_| {
+            counter.fetch_add(1, Ordering::SeqCst);
+        };
+        router.declare_subscriber("robot02/**").callback(hear).background().await.unwrap();
+        let counter = Arc::clone(&heard);
+        let obey = move |query: Query| {
+            counter.fetch_add(1, Ordering::SeqCst);
+            query.reply(query.key_expr(), "done").wait().unwrap();
+        };
+        router.declare_queryable("robot02/**").callback(obey).background().await.unwrap();
+        Self { heard }
+    }
+}
+
+impl Mesh {
+    async fn another_robot_is_out_of_reach(&self, robot: &Session) {
+        let other = OtherRobot::on(&self.router).await;
+        for key in ["scan", "odom", "tf", "tf_static", "slam/cmd/pause"] {
+            robot.put(format!("robot02/{key}"), "a lie").await.unwrap();
+        }
+        assert!(ask(robot, "robot02/slam/cmd/pause").await.is_empty());
+        assert!(ask(robot, "robot02/map").await.is_empty());
+        for key in ["scan", "odom", "tf", "tf_static"] {
+            let words = format!("unauthorized to Put (ingress) on robot02/{key}");
+            self.log.says(&["(robot01)", &words]).await;
+        }
+        let words = "unauthorized to Query (ingress) on robot02/slam/cmd/pause";
+        self.log.says(&["(robot01)", words]).await;
+        assert_eq!(other.heard.load(Ordering::SeqCst), 0);
+    }
+
+    /// The programs of who only looks.
+    async fn who_looks_is_served(&self, reader: &Session) {
+        let path = self.directory.path().join("for-programs.json5");
+        std::fs::write(&path, self.configuration("reader")).unwrap();
+        let path = path.to_str().unwrap().to_owned();
+        let listed = gmapd(&["list", "--zenoh", &path]).await;
+        assert!(listed.contains("robot01"), "{listed}");
+        let status = gmapd(&["get", "robot01", "status", "--zenoh", &path]).await;
+        assert!(status.contains("waiting"), "{status}");
+        let prefix = Prefix::parse("robot01").unwrap();
+        let mirror = MapMirror::follow(reader, &prefix).await.unwrap();
+        let mut states = mirror.states();
+        let live = states.wait_for(|state| state.is_alive && state.is_newest);
+        tokio::time::timeout(PATIENCE, live).await.unwrap().unwrap();
+    }
+}
+
+/// What the program prints, which has to succeed.
+async fn gmapd(arguments: &[&str]) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gmapd"));
+    command.args(arguments);
+    let output = tokio::task::spawn_blocking(move || command.output()).await.unwrap().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
 }
 
 /// One of the ready configurations, with whole paths.
@@ -222,7 +308,29 @@ async fn with_certificates_each_does_what_is_theirs_and_strangers_stay_outside()
     mesh.log.says(&["invalid peer certificate"]).await;
     // A router that is signed by somebody else is not believed either.
     mesh.refuses(&robot.replace("certificates/authority", "strangers/authority")).await;
+    // Nor is a robot that passes for the router.
+    let router = mesh.router_with("certificates/robot01").await;
+    mesh.refuses(&robot.replace(&mesh.locator, &router.1)).await;
+    mesh.log.says(&["server authentication"]).await;
+    mesh.refuses(&mesh.configuration("base").replace(&mesh.locator, &router.1)).await;
+    router.0.close().await.unwrap();
     mesh.keeps_each_to_what_is_theirs().await;
+}
+
+#[test]
+fn certificates_and_passwords_give_the_same_rights() {
+    let parts = ["", "password"].map(|kind| {
+        let text = std::fs::read_to_string(secure().join(kind).join("router.json5")).unwrap();
+        let config = zenoh::Config::from_json5(&text).unwrap();
+        let text = config.get_json("access_control").unwrap();
+        let mut control: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let subjects = control["subjects"].take();
+        let names = subjects.as_array().unwrap().iter().map(|subject| subject["id"].to_string());
+        (control, names.collect::<Vec<_>>())
+    });
+    assert_eq!(parts[0], parts[1]);
+    assert_eq!(parts[0].1.len(), 3);
+    assert!(parts[0].0["rules"].as_array().unwrap().len() > 3);
 }
 
 #[tokio::test(flavor = "multi_thread")]

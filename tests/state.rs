@@ -1,7 +1,8 @@
 //! The real daemon, killed and started again: it goes on where it was, byte for byte.
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -220,8 +221,11 @@ impl Daemon {
     }
 
     fn of(mut command: Command, mesh: &Mesh, robot: &str, arguments: &[&str]) -> Self {
-        command.args(["run", "--prefix", robot, "--threads", "1", "--zenoh"]);
+        command.args(["run", "--prefix", robot, "--zenoh"]);
         command.arg(&mesh.configuration).arg("--state").arg(mesh.state(robot));
+        if !arguments.contains(&"--threads") {
+            command.args(["--threads", "1"]);
+        }
         for set in ["particles=4", "linearUpdate=0.3", "scan_queue=500"] {
             command.args(["--set", set]);
         }
@@ -312,61 +316,171 @@ async fn after_a_kill_the_map_is_as_if_nothing_had_happened() {
     }
 }
 
-/// Each takes a few hundredths of a second.
-const KILLS: usize = 300;
+/// A robot whose daemon is killed again and again; each time takes a few hundredths of a second.
+struct Victim {
+    name: &'static str,
+    engine: &'static [&'static str],
+    arguments: &'static [&'static str],
+    /// Scans that need not be on the disk when nothing is being written.
+    interval: usize,
+    kills: usize,
+}
+
+const VICTIMS: [Victim; 4] = [
+    Victim {
+        name: "each-scan",
+        engine: ENGINES[0],
+        arguments: &EVERY_SCAN,
+        interval: 1,
+        kills: 120,
+    },
+    Victim {
+        name: "two-threads",
+        engine: ENGINES[0],
+        arguments: &["--set", "checkpoint={every_scans: 5}", "--threads", "2"],
+        interval: 5,
+        kills: 60,
+    },
+    Victim {
+        name: "without-particles",
+        engine: ENGINES[1],
+        arguments: &["--set", "checkpoint={every_scans: 5}"],
+        interval: 5,
+        kills: 60,
+    },
+    Victim {
+        name: "by-time",
+        engine: ENGINES[2],
+        arguments: &["--set", "checkpoint={every_scans: 100000, every_s: 0.1}"],
+        interval: 1,
+        kills: 60,
+    },
+];
 
 /// Moments that are fed again though they are not lost.
 const AGAIN: usize = 5;
 
-#[tokio::test(flavor = "multi_thread")]
-async fn it_survives_any_number_of_kills_at_any_moment() {
-    let mesh = Mesh::new().await;
-    let mut rng = ChaCha8Rng::seed_from_u64(11);
-    let rounds: Vec<usize> = (0..KILLS).map(|_| rng.random_range(0..8)).collect();
-    let moments = drive(rounds.iter().sum::<usize>() + 20);
-    let expected = undisturbed(&mesh, ENGINES[0], &moments).await;
-    let robot = mesh.robot("robot01").await;
-    // Of these, so many are known to be on the disk.
-    let (mut fed, mut written, mut most_lost) = (0, 0, 0);
-    for (round, more) in rounds.into_iter().enumerate() {
-        if round % 10 == 9 {
-            // Before it has read its state, while it does, or just after.
-            let daemon = Daemon::spawn(&mesh, "robot01", &EVERY_SCAN);
-            tokio::time::sleep(Duration::from_millis(rng.random_range(0..150))).await;
-            daemon.kill(&robot).await;
-        }
-        let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
+/// What is known of a daemon that was killed.
+#[derive(Debug, Default)]
+struct Losses {
+    /// Scans that were sent.
+    sent: usize,
+    /// Of these, so many are known to be on the disk.
+    written: usize,
+    /// The most that a kill lost, those without a verdict among them.
+    most: usize,
+    /// Kills while a checkpoint was being written.
+    in_writing: usize,
+}
+
+impl Losses {
+    /// What a daemon that was just started has, which is what must be on the disk at least.
+    async fn look(&mut self, robot: &Robot, moments: &[Moment]) -> usize {
         let checkpoint = robot.status().await["checkpoint"].take();
-        let kept = checkpoint["resumed_stamp"].as_i64();
-        let kept = moments.iter().take_while(|moment| Some(moment.stamp) <= kept).count();
-        let possible = written..=fed + 1;
-        assert!(possible.contains(&kept), "{round}: {kept} of {fed}: {checkpoint}");
-        most_lost = most_lost.max(fed.saturating_sub(kept));
-        let again = kept - AGAIN.min(kept);
-        let verdicts = robot.feed_all(&moments[again..(fed + more).max(kept)]).await;
-        let (known, new) = verdicts.split_at(kept - again);
-        assert!(known.iter().all(|verdict| verdict == "duplicate"), "round {round}: {known:?}");
-        assert!(new.iter().all(|verdict| verdict != "duplicate"), "round {round}: {new:?}");
-        fed += more;
-        if round % 5 == 0 && fed > 0 {
-            let last = moments[fed - 1].stamp;
-            robot.until_checkpoint(|status| status["last"]["stamp"].as_i64() >= Some(last)).await;
-            written = fed;
-        }
-        if round % 2 == 0 {
-            // Nobody knows what becomes of this one.
-            robot.send(&moments[fed]).await;
-        }
-        tokio::time::sleep(Duration::from_micros(rng.random_range(0..4000))).await;
-        daemon.kill(&robot).await;
+        let kept = up_to(moments, &checkpoint["resumed_stamp"]);
+        let possible = self.written..=self.sent;
+        assert!(possible.contains(&kept), "{kept} is not in {self:?}: {checkpoint}");
+        assert_eq!(checkpoint["refused"], serde_json::json!([]));
+        self.written = kept;
+        kept
     }
-    let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
-    robot.feed_all(&moments).await;
-    println!("at most {most_lost} scans were lost");
-    assert!(robot.results().await == expected);
+
+    /// Waits until nothing is to be written: then less than an interval can be lost.
+    async fn rest(&mut self, robot: &Robot, victim: &Victim, moments: &[Moment]) {
+        let least = self.sent.saturating_sub(victim.interval - 1);
+        let rests = |status: &Value| {
+            let last = [&status["last"]["stamp"], &status["resumed_stamp"]];
+            last.iter().any(|stamp| up_to(moments, stamp) >= least)
+        };
+        robot.until_checkpoint(rests).await;
+        self.written = self.written.max(least);
+    }
+}
+
+/// How many moments there are until a stamp; none until `null`.
+fn up_to(moments: &[Moment], stamp: &Value) -> usize {
+    moments.iter().take_while(|moment| Some(moment.stamp) <= stamp.as_i64()).count()
+}
+
+/// Files that somebody began to write and did not end.
+fn unfinished(directory: &Path) -> usize {
+    let names = fs::read_dir(directory).into_iter().flatten().flatten();
+    let names = names.map(|entry| entry.file_name().into_string().unwrap());
+    names.filter(|name| name.starts_with(".checkpoint-") && name.ends_with(".tmp")).count()
+}
+
+/// One life: it goes on where the one before was, is fed, and is killed at any moment.
+async fn live(
+    mesh: &Mesh,
+    robot: &Robot,
+    (victim, moments): (&Victim, &[Moment]),
+    (losses, rng): (&mut Losses, &mut ChaCha8Rng),
+) {
+    let daemon = Daemon::start(mesh, robot, &[victim.engine, victim.arguments].concat()).await;
+    let told = losses.sent;
+    let kept = losses.look(robot, moments).await;
+    let again = kept - AGAIN.min(kept);
+    losses.sent = losses.sent.max(kept) + rng.random_range(0..8);
+    let verdicts = robot.feed_all(&moments[again..losses.sent]).await;
+    let (known, new) = verdicts.split_at(kept - again);
+    assert!(known.iter().all(|verdict| verdict == "duplicate"), "{losses:?}: {known:?}");
+    assert!(new.iter().all(|verdict| verdict != "duplicate"), "{losses:?}: {new:?}");
+    losses.most = losses.most.max(told - kept);
+    if rng.random_bool(0.5) {
+        losses.rest(robot, victim, moments).await;
+    }
+    // Nobody knows what becomes of these.
+    for _ in 0..rng.random_range(0..4) {
+        robot.send(&moments[losses.sent]).await;
+        losses.sent += 1;
+    }
+    tokio::time::sleep(Duration::from_micros(rng.random_range(0..4000))).await;
+    daemon.kill(robot).await;
+    losses.in_writing += unfinished(&mesh.state(&robot.name));
+}
+
+/// Kills a daemon before it has read its state, while it does, or just after.
+async fn nip_in_the_bud(mesh: &Mesh, robot: &Robot, victim: &Victim, rng: &mut ChaCha8Rng) {
+    let arguments = [victim.engine, victim.arguments].concat();
+    let daemon = Daemon::spawn(mesh, &robot.name, &arguments);
+    tokio::time::sleep(Duration::from_millis(rng.random_range(0..150))).await;
+    daemon.kill(robot).await;
+}
+
+/// Kills that came while a checkpoint was being written.
+async fn survives(mesh: &Mesh, victim: &Victim) -> usize {
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    // In a life, seven scans with a verdict and three without at most.
+    let moments = drive(victim.kills * 10 + 20);
+    let robot = mesh.robot(victim.name).await;
+    let mut losses = Losses::default();
+    for round in 0..victim.kills {
+        if round % 10 == 9 {
+            nip_in_the_bud(mesh, &robot, victim, &mut rng).await;
+        }
+        live(mesh, &robot, (victim, &moments), (&mut losses, &mut rng)).await;
+    }
+    let Losses { sent, most, in_writing, .. } = losses;
+    println!("{}: {in_writing} kills in writing, {most} of {sent} scans lost at most", victim.name);
+    let moments = &moments[..sent + 10];
+    let daemon = Daemon::start(mesh, &robot, &[victim.engine, victim.arguments].concat()).await;
+    robot.feed_all(moments).await;
+    let results = robot.results().await;
     daemon.terminate(&robot).await;
-    let kept = checkpoints(&mesh.state("robot01")).len();
+    let kept = checkpoints(&mesh.state(victim.name)).len();
     assert!(kept <= 4, "{kept} checkpoints are kept");
+    assert!(results == undisturbed(mesh, victim.engine, moments).await, "{}", victim.name);
+    in_writing
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn it_survives_any_number_of_kills_at_any_moment_and_loses_no_more_than_the_interval() {
+    let mesh = Mesh::new().await;
+    let mut in_writing = 0;
+    for victim in &VICTIMS {
+        in_writing += survives(&mesh, victim).await;
+    }
+    assert!(in_writing > 0, "no kill came while a checkpoint was being written");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -514,6 +628,108 @@ async fn what_cannot_be_written_is_told_and_mapping_goes_on() {
 
     let daemon = Daemon::start(&mesh, &robot, &EVERY_SCAN).await;
     assert_eq!(robot.status().await["checkpoint"]["resumed_from"], last);
+    daemon.terminate(&robot).await;
+}
+
+/// A small disk, which only programs that were started on it see.
+struct SmallDisk {
+    holder: Child,
+    mounted_on: PathBuf,
+}
+
+impl SmallDisk {
+    /// `None` without the rights to have one.
+    fn new(directory: &Path) -> Option<Self> {
+        fs::create_dir_all(directory).unwrap();
+        let script = r#"mount -t tmpfs -o size=2M tmpfs "$0" && echo mounted && exec sleep 1000"#;
+        let mut holder = Command::new("unshare")
+            .args(["--mount", "sh", "-c", script])
+            .arg(directory)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(holder.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let disk = Self { holder, mounted_on: directory.to_owned() };
+        let is_root = Command::new("id").arg("-u").output().unwrap().stdout == b"0\n";
+        let must = is_root && std::env::var_os("GMAPD_CI").is_some();
+        assert!(line == "mounted\n" || !must, "root can mount no disk");
+        (line == "mounted\n").then_some(disk)
+    }
+
+    /// Runs a command where the disk is.
+    fn command(&self, words: &[&str]) -> Command {
+        let mut command = Command::new("nsenter");
+        command.args(["--mount", "--target", &self.holder.id().to_string()]).args(words);
+        command
+    }
+
+    /// What is on it, as it is seen from outside.
+    fn path(&self) -> PathBuf {
+        let root = PathBuf::from(format!("/proc/{}/root", self.holder.id()));
+        root.join(self.mounted_on.strip_prefix("/").unwrap())
+    }
+
+    /// The bytes of each checkpoint.
+    fn files(&self) -> Vec<(u64, Vec<u8>)> {
+        let files = checkpoints(&self.path()).into_iter();
+        files.map(|(number, path)| (number, fs::read(path).unwrap())).collect()
+    }
+
+    /// Until nothing goes on it any more.
+    fn fill(&self) {
+        let mut file = File::create(self.path().join("filler")).unwrap();
+        while file.write_all(&[7; 4096]).is_ok() {}
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        self.holder.kill().ok();
+        self.holder.wait().ok();
+    }
+}
+
+/// Feeds scans to a daemon that cannot write; what is on the disk stays as it is.
+async fn goes_on_without_writing(robot: &Robot, moments: &[Moment], disk: &SmallDisk, why: &str) {
+    let before = disk.files();
+    let verdicts = robot.feed_all(moments).await;
+    assert!(verdicts.iter().any(|verdict| verdict == "processed"), "{verdicts:?}");
+    let status = robot.until_checkpoint(|status| status["error"] != Value::Null).await;
+    assert!(status["error"].as_str().unwrap().contains(why), "{status}");
+    assert!(!before.is_empty() && disk.files() == before, "files are others than before");
+    assert_eq!(unfinished(&disk.path()), 0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn on_a_full_or_read_only_disk_mapping_goes_on_and_what_is_there_stays() {
+    let mesh = Mesh::new().await;
+    let Some(disk) = SmallDisk::new(&mesh.state("robot01")) else {
+        return eprintln!("skipped: only root can mount a small disk");
+    };
+    let moments = drive(120);
+    let robot = mesh.robot("robot01").await;
+    let gmapd = || disk.command(&[env!("CARGO_BIN_EXE_gmapd")]);
+    let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
+    robot.until(Daemons::One).await;
+    robot.feed_all(&moments[..20]).await;
+    robot.until_checkpoint(|status| status["last"]["scans"] == 20).await;
+    disk.fill();
+    goes_on_without_writing(&robot, &moments[20..50], &disk, "No space left on device").await;
+    fs::remove_file(disk.path().join("filler")).unwrap();
+    robot.feed_all(&moments[50..60]).await;
+    let status = robot.until_checkpoint(|status| status["last"]["scans"] == 60).await;
+    assert_eq!(status["error"], Value::Null);
+    daemon.kill(&robot).await;
+
+    let mut remount = disk.command(&["mount", "-o", "remount,ro"]);
+    assert!(remount.arg(&disk.mounted_on).status().unwrap().success());
+    let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
+    robot.until(Daemons::One).await;
+    let checkpoint = robot.status().await["checkpoint"].take();
+    assert_eq!(checkpoint["resumed_from"], status["last"]["file"]);
+    assert_eq!(checkpoint["resumed_stamp"], moments[59].stamp);
+    goes_on_without_writing(&robot, &moments[60..], &disk, "Read-only file system").await;
     daemon.terminate(&robot).await;
 }
 

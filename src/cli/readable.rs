@@ -167,7 +167,7 @@ fn daemon(status: &Value) -> Option<String> {
 fn input_line(input: &Value) -> Option<String> {
     let received = input["received"].as_u64()?;
     let mut text = format!("{}: {received} received", input["key"].as_str()?);
-    for count in ["rejected", "dropped", "duplicates", "reordered", "clock_restarts"] {
+    for count in ["rejected", "dropped", "duplicates", "reordered", "clock_restarts", "gaps"] {
         if let Some(number) = input[count].as_u64().filter(|&number| number > 0) {
             write!(text, ", {number} {}", count.replace('_', " ")).ok();
         }

@@ -56,7 +56,7 @@ impl Checkpoint {
 }
 
 /// How it goes with checkpoints.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct CheckpointStatus {
     /// Where they are.
     pub directory: PathBuf,
@@ -480,5 +480,62 @@ mod tests {
         drop(waiting);
         jobs.send(Pending::new(&pending)).unwrap_err();
         assert_eq!(pending.load(Ordering::Acquire), 0);
+    }
+
+    const SECOND: Duration = Duration::from_secs(1);
+
+    /// Due after ten seconds or five scans, with three scans that are in the last.
+    fn keeper() -> (Keeper, Instant) {
+        let start = clock::now();
+        let keeper = Keeper {
+            jobs: channel().0,
+            status: SharedStatus::default(),
+            pending: Arc::default(),
+            asked: Vec::new(),
+            every: 10 * SECOND,
+            every_scans: 5,
+            last: (start, 3),
+            commanded: false,
+        };
+        (keeper, start)
+    }
+
+    #[test]
+    fn it_is_due_by_scans_or_by_time_with_a_scan() {
+        let (keeper, start) = keeper();
+        assert!(!keeper.is_due(start, 3));
+        assert!(!keeper.is_due(start, 7));
+        assert!(keeper.is_due(start, 8));
+        assert!(!keeper.is_due(start + 9 * SECOND, 4));
+        assert!(keeper.is_due(start + 10 * SECOND, 4));
+        assert!(!keeper.is_due(start + 100 * SECOND, 3), "nothing has come");
+    }
+
+    #[test]
+    fn a_command_makes_it_due_at_once() {
+        let (mut keeper, start) = keeper();
+        keeper.note_command();
+        assert!(keeper.is_due(start, 3));
+    }
+
+    #[test]
+    fn while_one_is_being_written_none_is_due_and_it_is_looked_again_soon() {
+        let (mut keeper, start) = keeper();
+        keeper.pending.store(1, Ordering::Release);
+        assert!(!keeper.is_due(start + 100 * SECOND, 100));
+        assert_eq!(keeper.deadline(start, 100), Some(start + LOOK));
+        keeper.note_command();
+        assert!(!keeper.is_due(start, 3));
+        assert_eq!(keeper.deadline(start, 3), Some(start + LOOK));
+        keeper.pending.store(0, Ordering::Release);
+        assert!(keeper.is_due(start, 3));
+    }
+
+    #[test]
+    fn though_nothing_comes_any_more_what_came_is_written_when_it_is_time() {
+        let (keeper, start) = keeper();
+        assert_eq!(keeper.deadline(start, 3), None);
+        assert_eq!(keeper.deadline(start, 4), Some(start + 10 * SECOND));
+        assert_eq!(keeper.deadline(start + 20 * SECOND, 4), Some(start + 20 * SECOND + LOOK));
     }
 }

@@ -8,6 +8,7 @@ use tokio::sync::Notify;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
+use super::gaps::Gaps;
 use super::ledger::Verdict;
 use super::mailbox::{Mail, Mailbox};
 use super::synchronizer::{FramedScan, Refusal};
@@ -109,6 +110,8 @@ pub struct Tally {
     pub last_rejection: Option<String>,
     /// When the last came.
     pub last: Option<Instant>,
+    /// Outages; of transforms, which have many senders, they are not known.
+    pub gaps: Gaps,
 }
 
 /// A sample as it came.
@@ -218,6 +221,11 @@ impl Inbox {
         let tally = &mut state.queues.entry(input).or_default().tally;
         tally.rejected += 1;
         tally.last_rejection = Some(reason);
+    }
+
+    /// Takes the stamp of a message that was decoded.
+    fn note(&self, input: Input, stamp: Stamp) {
+        self.lock().queues.entry(input).or_default().tally.gaps.note(stamp);
     }
 
     /// How much came.
@@ -342,7 +350,10 @@ impl Decoder<'_> {
         let frame = message.header.frame_id.clone();
         let stamp = convert::stamp(message.header.stamp).ok();
         match convert::scan(message) {
-            Ok(scan) => self.mailbox.put(Mail::Scan(FramedScan { scan, frame })),
+            Ok(scan) => {
+                self.inbox.note(Input::Scan, scan.stamp);
+                self.mailbox.put(Mail::Scan(FramedScan { scan, frame }));
+            }
             Err(error) => self.refuse(stamp, Verdict::BadGeometry, error.to_string()),
         }
     }
@@ -358,7 +369,10 @@ impl Decoder<'_> {
             .map_err(|error| error.to_string())
             .and_then(|message| convert::odometry(message).map_err(|error| error.to_string()));
         match sample {
-            Ok(sample) => self.mailbox.put(Mail::Odometry(sample.stamp, sample.odom_from_base)),
+            Ok(sample) => {
+                self.inbox.note(Input::Odom, sample.stamp);
+                self.mailbox.put(Mail::Odometry(sample.stamp, sample.odom_from_base));
+            }
             Err(reason) => self.inbox.reject(Input::Odom, reason),
         }
     }
@@ -369,7 +383,10 @@ impl Decoder<'_> {
             Err(error) => return self.inbox.reject(Input::Pose, error.to_string()),
         };
         match convert::stamped_pose(message) {
-            Ok(pose) => self.mailbox.put(Mail::Pose(pose)),
+            Ok(pose) => {
+                self.inbox.note(Input::Pose, pose.stamp);
+                self.mailbox.put(Mail::Pose(pose));
+            }
             Err(error) => self.inbox.reject(Input::Pose, error.to_string()),
         }
     }

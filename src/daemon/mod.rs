@@ -11,6 +11,7 @@ pub mod command;
 mod diagnostics;
 pub mod formats;
 pub mod frames;
+pub mod gaps;
 pub mod input;
 mod judgement;
 pub mod keys;

@@ -96,6 +96,10 @@ pub struct InputStatus {
     pub reordered: u64,
     /// Times the sender's clock was set back.
     pub clock_restarts: u64,
+    /// Outages: stamps more than a second apart. Transforms are not looked at.
+    pub gaps: u64,
+    /// The longest outage, by the stamps.
+    pub longest_gap_s: f64,
 }
 
 /// About the particles.
@@ -272,6 +276,8 @@ impl StatusSource {
             dropped: tally.dropped + lost,
             last_rejection: tally.last_rejection,
             age_s: tally.last.map(|last| now.saturating_duration_since(last).as_secs_f64()),
+            gaps: tally.gaps.count,
+            longest_gap_s: tally.gaps.longest_s,
             ..InputStatus::default()
         };
         match input {

@@ -10,7 +10,7 @@ use super::hector::state::HectorState;
 use super::known_poses::KnownPosesState;
 use super::pose::Pose2;
 
-/// Twice as far as odometry is believed in, m.
+/// Twice as far as odometry is believed in, m; and as many radians, that nothing overflows.
 const FURTHEST: f64 = 2e7;
 
 /// Of variances, weights and scores.
@@ -65,7 +65,9 @@ pub(super) fn ensure_poses(
     mut poses: impl Iterator<Item = Pose2>,
     what: &'static str,
 ) -> Result<(), StateError> {
-    let possible = |pose: Pose2| pose.is_finite() && pose.position().norm() <= FURTHEST;
+    let possible = |pose: Pose2| {
+        pose.is_finite() && pose.position().norm() <= FURTHEST && pose.theta.abs() <= FURTHEST
+    };
     if poses.all(possible) { Ok(()) } else { Err(StateError::OutOfRange(what)) }
 }
 
