@@ -106,6 +106,9 @@ pub struct FilterStatus {
     pub resamples: u64,
     /// Odometry steps that were too long to be believed.
     pub odometry_jumps: u64,
+    /// Scans that were not deskewed, for odometry has the robot move faster than 10 m/s or 10 rad/s
+    /// during their sweeps: it was reset meanwhile, or a pose found anew.
+    pub scans_not_deskewed: u64,
     /// Scans that went without odometry; only engines that can do without have such.
     pub scans_without_odometry: u64,
     /// Processed scans that left a direction open, where the engine looks for it.
@@ -323,6 +326,7 @@ fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
         effective_sample_size: report.map(|report| report.effective_sample_size),
         resamples: snapshot.resamples,
         odometry_jumps: gauges.odometry_jumps,
+        scans_not_deskewed: gauges.scans.not_deskewed,
         scans_without_odometry: gauges.without_odometry,
         weak_directions: gauges.weak,
         weak_direction: report.and_then(|report| report.weak_direction),
