@@ -204,6 +204,43 @@ fn without_odometry_the_corridors_direction_is_told_all_the_same() {
     assert!(amid.len() > 100 && amid.iter().all(|report| report.weak_direction.is_some()));
 }
 
+/// Stamps say nothing then of how far the robot may have got.
+#[test]
+fn without_odometry_backwards_and_repeated_stamps_do_no_harm() {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    hector.set_pose(route(CORNER)[0]);
+    for (index, mut shot) in (0..).zip(shots(&room(CORNER), &lidar, &route(CORNER))) {
+        shot.scan.stamp = Stamp(5_000_000_000 - (index / 2) * 100_000_000);
+        let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base: None };
+        report(hector.add_scan(&sweep, &mut |_| ()));
+        let error = shot.odom_from_base.between(hector.pose_in_map());
+        assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{index}: {error:?}");
+    }
+}
+
+/// Whoever points at a map is off by a hand's breadth.
+#[test]
+fn a_pose_that_is_set_is_doubted_and_two_scans_find_the_true_one() {
+    let lidar = full_circle(360);
+    let drive = shots(&room(CORNER), &lidar, &route(CORNER));
+    for beside in [Pose2::new(0.3, 0.0, 0.2), Pose2::new(0.0, -0.3, -0.2)] {
+        let mut hector = Hector::new(Parameters::default());
+        for (index, shot) in drive.iter().enumerate().take(14) {
+            if index == 12 {
+                hector.set_pose(drive[11].odom_from_base * beside);
+                let covariance = hector.covariance();
+                assert!(covariance[(0, 0)] >= 0.01 && covariance[(2, 2)] >= 0.0025, "{covariance}");
+            }
+            let odom_from_base = Some(shot.odom_from_base);
+            let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base };
+            assert_eq!(report(hector.add_scan(&sweep, &mut |_| ())).matched, 1);
+        }
+        let error = drive[13].odom_from_base.between(hector.pose_in_map());
+        assert!(error.position().norm() < 0.03 && error.theta.abs() < 0.01, "{error:?}");
+    }
+}
+
 #[test]
 fn a_room_leaves_nothing_open_and_is_mapped_without_odometry() {
     let lidar = full_circle(360);

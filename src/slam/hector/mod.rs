@@ -153,7 +153,8 @@ impl Hector {
             self.parameters.initial_pose = Some(pose_in_map);
             return;
         };
-        *state = State { pose_in_map, velocity: None, ..*state };
+        let Prediction { covariance, .. } = Prediction::within(pose_in_map, INITIAL);
+        *state = State { pose_in_map, covariance, velocity: None, ..*state };
         self.odometry.since_processed = Motion::default();
         self.odometry.anchor(pose_in_map);
     }
