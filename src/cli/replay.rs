@@ -172,6 +172,10 @@ fn along(poses: Along, log: &Log, config: &Config, mut replay: Replay) -> anyhow
                 add(&mut replay, log, config, &reading);
                 progress.advance(reading.stamp);
             }
+            Event::ScanAlone(scan, mount) => {
+                replay.add_scan_alone(&scan, &mount);
+                progress.advance(scan.stamp);
+            }
             Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
     }
@@ -205,6 +209,8 @@ fn along_given_poses(
                     Err(_) => {}
                 }
             }
+            // The file says where it was taken, whatever the log says.
+            Event::ScanAlone(..) => {}
             Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
     }

@@ -391,6 +391,18 @@ pub enum EngineKind {
     KnownPoses,
 }
 
+impl EngineKind {
+    /// Whether scans without odometry, or without the pose that stands in its place, are of no use
+    /// to it.
+    #[must_use]
+    pub const fn needs_odometry(self) -> bool {
+        match self {
+            Self::Gmapping | Self::KnownPoses => true,
+            Self::Hector => false,
+        }
+    }
+}
+
 /// Where the first scan was taken.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, expecting = "[x, y, yaw] or search is needed")]

@@ -205,7 +205,8 @@ impl Mapper {
         let config = &config.with_poses_as_odometry();
         let parameters = config.parameters();
         let engine = starting::engine(config, threads)?;
-        let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
+        let needed = config.raw.engine.needs_odometry();
+        let need = if needed { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
             initial_pose: parameters.initial_pose,
