@@ -103,7 +103,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let watch = Stopwatch::start();
     let outcome = match poses(arguments, &config)? {
         Poses::Odometry => along(Along::Odometry, &log, &config, replay)?,
-        Poses::OfLog => along(Along::CorrectedPoses, &log, &config, replay)?,
+        Poses::OfLog => {
+            log.warn_of_odometry(&arguments.log)?;
+            along(Along::CorrectedPoses, &log, &config, replay)?
+        }
         Poses::Given(poses) => along_given_poses(&log, &config, replay, &poses)?,
     };
     let elapsed = watch.elapsed();

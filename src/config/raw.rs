@@ -223,7 +223,7 @@ pub(super) const HECTOR_KEYS: [(&str, &str); 27] = [
     ("scan_subscriber_queue_size", "scan_queue takes its place"),
     ("scan_topic", "keys takes its place"),
     ("sys_msg_topic", "slam/cmd/reset takes its place"),
-    ("pose_update_topic", "the pose is published on slam/pose"),
+    ("pose_update_topic", "the pose is published on pose"),
     ("use_tf_scan_transformation", "the laser's mount is always used"),
     ("use_tf_pose_start_estimate", "odometry is used where there is some"),
     ("map_with_known_poses", "it is an engine of its own"),

@@ -680,7 +680,8 @@ enum Flow {
 fn detail(verdict: Verdict, ready: &ReadyScan) -> String {
     match verdict {
         Verdict::NoUsableBeams => format!(
-            "none of its {} beams ends within range_max and maxUrange or laser_max_dist",
+            "none of its {} beams ends between range_min and range_max and within maxUrange, or \
+             with Hector between laser_min_dist and laser_max_dist",
             ready.scan.ranges.len()
         ),
         Verdict::BadOdometry => {

@@ -206,7 +206,8 @@ impl StatusSource {
         gauges: &Gauges,
     ) -> (State, String) {
         let uptime_s = self.uptime_s();
-        judgement::judge(&Circumstances { uptime_s, inputs, snapshot, gauges })
+        let engine = self.engine;
+        judgement::judge(&Circumstances { engine, uptime_s, inputs, snapshot, gauges })
     }
 
     fn uptime_s(&self) -> f64 {
