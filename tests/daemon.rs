@@ -712,6 +712,37 @@ async fn a_paused_daemon_takes_no_scan_and_goes_on_where_the_robot_is() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn other_engines_pause_and_go_on_too() {
+    let moments = drive(20);
+    for engine in ["engine=hector", "engine=known_poses"] {
+        let mut rig = Rig::mounted(&[engine]).await;
+        let poses = rig.daemon.status().inputs.contains_key("pose");
+        for (index, moment) in moments.iter().enumerate() {
+            match index {
+                1 => assert!(rig.command(Command::Pause).await.changed),
+                19 => assert!(rig.command(Command::Resume).await.changed),
+                _ => {}
+            }
+            if poses {
+                rig.robot.put(&rig.robot.odom, &moment.pose_in("map")).await;
+            } else {
+                rig.robot.odometry(moment).await;
+            }
+            rig.robot.scan(moment).await;
+            let paused = (1..19).contains(&index);
+            let expected = if paused { Verdict::Paused } else { Verdict::Processed };
+            assert_eq!(rig.verdict().await.verdict, expected, "{engine}: {index}");
+            let state = rig.daemon.status().state;
+            assert_eq!(state == State::Paused, paused, "{engine}: {state:?}");
+        }
+        let way: Vec<Pose2> = path(&*rig.end().await).iter().map(|(_, pose)| pose).collect();
+        let driven = moments[0].odom_from_base().between(moments[19].odom_from_base());
+        let error = driven.between(way[0].between(way[1]));
+        assert!(way.len() == 2 && error.position().norm() < 0.1, "{way:?} {driven:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_reset_begins_a_new_map_at_the_pose_that_is_given() {
     let moments = drive(3);
     let mut rig = Rig::mounted(&[]).await;
