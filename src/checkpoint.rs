@@ -20,7 +20,7 @@ use crate::slam::pose::Stamp;
 pub use store::{Store, StoreError, checkpoints};
 
 /// Of the state within, too: what is written by another version is not read.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 const MAGIC: &[u8; 12] = b"gmapd state\n";
 const FIXED: usize = MAGIC.len() + 4 + 4 + 8;
@@ -337,9 +337,9 @@ mod tests {
 
     #[test]
     fn another_format_and_a_body_that_is_not_as_told_are_refused() {
-        let newer = forged(|bytes| bytes[12] = 2);
+        let newer = forged(|bytes| bytes[12] += 1);
         let refusal = open(&newer).unwrap_err().to_string();
-        assert_eq!(refusal, "it has format version 2, and this gmapd reads 1");
+        assert_eq!(refusal, "it has format version 3, and this gmapd reads 2");
         let other = seal(head(), &[7; 300]).unwrap();
         for told in [299_u64, 301, 1 << 40] {
             let mut opened = open(&other).unwrap();

@@ -111,8 +111,12 @@ pub fn scan(message: ros::LaserScan) -> Result<Scan, ConvertError> {
         [message.angle_min.into(), message.angle_max.into()],
         message.angle_increment.into(),
         [message.range_min.into(), message.range_max.into()],
-    )?
-    .with_time_increment(message.time_increment.into());
+    )?;
+    let (field, value) = ("time_increment", f64::from(message.time_increment));
+    if !value.is_finite() {
+        return Err(GeometryError::NotFinite { field, value }.into());
+    }
+    let geometry = geometry.with_time_increment(value);
     Ok(Scan { stamp: stamp(message.header.stamp)?, geometry, ranges: message.ranges })
 }
 

@@ -25,6 +25,7 @@ use crate::logs::recording::{Kind, Message, Messages, RawMessage, Recording, Rec
 use crate::logs::{Fault, LogStatistics, Reading};
 use crate::ros;
 use crate::slam::pose::Stamp;
+use crate::slam::scan::{LaserMount, Scan};
 use crate::tf;
 
 /// Why a recording cannot be used.
@@ -133,6 +134,8 @@ impl Recorded {
 pub enum Event {
     /// For the filter.
     Reading(Reading),
+    /// A scan for the filter that goes without odometry, and how its laser sits.
+    ScanAlone(Scan, LaserMount),
     /// A scan that does not reach the filter.
     Refused(Refusal),
 }

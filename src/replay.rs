@@ -32,7 +32,7 @@ use crate::starting::{self, StartError};
 #[derive(Debug)]
 pub struct Replay {
     engine: Engine,
-    /// What odometry says is kept from the engine if the configuration wants none.
+    /// What odometry says is passed over if the configuration wants none.
     source: OdometrySource,
     weak: u64,
     mount: Option<LaserMount>,
@@ -74,18 +74,20 @@ impl Replay {
     pub fn add(&mut self, reading: &Reading) -> Verdict {
         let mount = mount_as_received(&reading.mount);
         let scan = reading.scan.as_ref().map(scan_as_received);
-        self.take(
-            reading.stamp,
-            convert::odometry_as_received(reading.stamp, reading.odom_from_base),
-            scan.as_ref(),
-            &mount,
-        )
+        let odom_from_base = convert::odometry_as_received(reading.stamp, reading.odom_from_base);
+        self.take(reading.stamp, self.wanted(odom_from_base), scan.as_ref(), &mount)
     }
 
     /// Takes the next reading as messages have brought it.
     pub fn add_received(&mut self, reading: &Reading) -> Verdict {
         let scan = reading.scan.clone().map(Some);
-        self.take(reading.stamp, reading.odom_from_base, scan.as_ref(), &reading.mount)
+        let odom_from_base = self.wanted(reading.odom_from_base);
+        self.take(reading.stamp, odom_from_base, scan.as_ref(), &reading.mount)
+    }
+
+    /// Takes a scan that messages have brought, and no odometry with it.
+    pub fn add_scan_alone(&mut self, scan: &Scan, mount: &LaserMount) -> Verdict {
+        self.take(scan.stamp, None, Some(&Some(scan.clone())), mount)
     }
 
     /// Counts a scan that does not reach the filter, for want of odometry or order.
@@ -97,7 +99,7 @@ impl Replay {
     fn take(
         &mut self,
         stamp: Stamp,
-        odom_from_base: Pose2,
+        odom_from_base: Option<Pose2>,
         scan: Option<&Option<Scan>>,
         mount: &LaserMount,
     ) -> Verdict {
@@ -131,21 +133,26 @@ impl Replay {
         }
     }
 
+    /// What odometry says, unless the configuration wants none.
+    fn wanted(&self, odom_from_base: Pose2) -> Option<Pose2> {
+        (self.source != OdometrySource::None).then_some(odom_from_base)
+    }
+
     /// Every reading's odometry passes the jump guard; a scan's counts no second time after it.
-    fn add_odometry(&mut self, stamp: Stamp, odom_from_base: Pose2) -> OdometryUpdate {
-        let step = match self.source {
-            OdometrySource::None if odom_from_base.is_finite() => OdometryUpdate::Accepted,
-            OdometrySource::None => OdometryUpdate::NotUsable,
-            _ => self.engine.add_odometry(odom_from_base),
-        };
+    fn add_odometry(&mut self, stamp: Stamp, odom_from_base: Option<Pose2>) -> OdometryUpdate {
+        let step = odom_from_base
+            .map_or(OdometryUpdate::Accepted, |odometry| self.engine.add_odometry(odometry));
         self.track.add(stamp, odom_from_base, step);
         step
     }
 
-    fn add_scan(&mut self, scan: &Scan, mount: &LaserMount, odom_from_base: Pose2) -> Verdict {
+    fn add_scan(
+        &mut self,
+        scan: &Scan,
+        mount: &LaserMount,
+        odom_from_base: Option<Pose2>,
+    ) -> Verdict {
         let mount = &self.mount.unwrap_or(*mount);
-        let wanted = self.source != OdometrySource::None;
-        let odom_from_base = wanted.then_some(odom_from_base);
         let sweep = Sweep { scan, mount, odom_from_base };
         let mut phases = [Elapsed::default(); PHASES];
         let total = Stopwatch::start();
@@ -297,19 +304,17 @@ struct Track {
 }
 
 impl Track {
-    fn add(&mut self, stamp: Stamp, odom_from_base: Pose2, step: OdometryUpdate) {
+    /// Without odometry the robot is taken to stand, and what odometry says next has no beginning.
+    fn add(&mut self, stamp: Stamp, odom_from_base: Option<Pose2>, step: OdometryUpdate) {
         let last = self.readings.last().map(|reading| reading.pose);
-        let pose = match (step, last, self.last_odom_from_base) {
-            (OdometryUpdate::Accepted, Some(last), Some(before)) => {
-                last * before.between(odom_from_base)
-            }
-            (OdometryUpdate::Accepted, ..) => odom_from_base,
-            (OdometryUpdate::JumpRejected | OdometryUpdate::NotUsable, last, _) => {
-                last.unwrap_or_default()
-            }
+        let accepted = odom_from_base.filter(|_| step == OdometryUpdate::Accepted);
+        let pose = match (accepted, last, self.last_odom_from_base) {
+            (Some(now), Some(last), Some(before)) => last * before.between(now),
+            (Some(now), None, _) => now,
+            (_, last, _) => last.unwrap_or_default(),
         };
         if step != OdometryUpdate::NotUsable {
-            self.last_odom_from_base = Some(odom_from_base);
+            self.last_odom_from_base = odom_from_base;
         }
         self.readings.push(StampedPose { stamp, pose });
     }
@@ -350,7 +355,7 @@ mod tests {
     fn track(readings: &[(Pose2, OdometryUpdate)], processed: &[usize]) -> Track {
         let mut track = Track::default();
         for (index, &(odom_from_base, step)) in readings.iter().enumerate() {
-            track.add(Stamp(0), odom_from_base, step);
+            track.add(Stamp(0), Some(odom_from_base), step);
             if processed.contains(&index) {
                 track.mark_processed();
             }
@@ -393,6 +398,20 @@ mod tests {
         let poses = track.corrected(&std::iter::once((Stamp(0), at(0.0))).collect());
         let x: Vec<f64> = poses.iter().map(|p| p.pose.x).collect();
         assert_eq!(x, [0.0, 0.0, 1.0, 1.0, 2.0]);
+    }
+
+    #[test]
+    fn without_odometry_the_robot_stands_between_scans() {
+        let mut track = Track::default();
+        for odom_from_base in [Some(at(5.0)), Some(at(6.0)), None, Some(at(9.0)), Some(at(9.5))] {
+            track.add(Stamp(0), odom_from_base, OdometryUpdate::Accepted);
+            if odom_from_base.is_none() {
+                track.mark_processed();
+            }
+        }
+        let poses = track.corrected(&std::iter::once((Stamp(0), at(20.0))).collect());
+        let x: Vec<f64> = poses.iter().map(|p| p.pose.x).collect();
+        assert_eq!(x, [19.0, 20.0, 20.0, 20.0, 20.5]);
     }
 
     #[test]

@@ -9,6 +9,8 @@ use gmapd::config::Config;
 use gmapd::evaluation::{
     Alignment, StampedPose, absolute_errors, read_relations, relation_errors, revisit_agreement,
 };
+use gmapd::given_poses::GivenPoses;
+use gmapd::logs::Reading;
 use gmapd::logs::carmen::CarmenLog;
 use gmapd::replay::{Outcome, Replay, Verdict};
 use gmapd::sim::{Place, Scenario, Simulation};
@@ -16,6 +18,7 @@ use gmapd::slam::gmapping::prepared_scan::PreparedScan;
 use gmapd::slam::gmapping::{GMapping, ScanReading, ScanUpdate};
 use gmapd::slam::grid::occupancy::BeamEndKind;
 use gmapd::slam::pose::{Point2, Pose2};
+use gmapd::slam::scan::Beam;
 
 /// The true pose and the one the filter ends up with, at each processed scan.
 struct Drive {
@@ -161,6 +164,108 @@ fn hector_maps_intel_with_odometry_and_without() {
         eprintln!("intel, {odometry}: {error:.4} m");
         assert!(error < 0.22, "{error} m");
     }
+}
+
+/// With the cells that it has if nobody says otherwise.
+#[test]
+fn hector_maps_intel_in_fine_cells_with_odometry() {
+    let (Some(log), Some(relations)) =
+        (recorded("intel/intel.log"), recorded("intel/intel.relations"))
+    else {
+        return;
+    };
+    let relations = read_relations(&relations).expect("they are relations");
+    let log = CarmenLog::open(&log).expect("it is a log");
+    let outcome = replay(&log, &config(&["engine=hector"]));
+    let report = relation_errors(&outcome.trajectory, &relations);
+    assert_eq!(report.used, 2984);
+    let error = report.translation_m.expect("some used").mean;
+    eprintln!("intel in cells of 2.5 cm: {error:.4} m");
+    assert!(error < 0.22, "{error} m");
+}
+
+/// Mean and worst difference of the motion in 20 scans, about two seconds, from odometry's, m.
+fn motion_errors(log: &CarmenLog, config: &Config) -> [f64; 2] {
+    let mut replay = Replay::new(config, 1).expect("it needs no thread");
+    let mut odometry = Vec::new();
+    for reading in log.readings().expect("it opened before") {
+        let reading = reading.expect("it can be read to its end");
+        if replay.add(&reading) == Verdict::Processed {
+            odometry.push(reading.odom_from_base);
+        }
+    }
+    let path: Vec<Pose2> = replay.finish().path.iter().map(|(_, pose)| pose).collect();
+    assert!(path.len() == odometry.len() && path.len() > 700, "{} scans", path.len());
+    let found = path.iter().zip(&path[20..]).map(|(a, b)| a.between(*b));
+    let expected = odometry.iter().zip(&odometry[20..]).map(|(a, b)| a.between(*b));
+    let errors: Vec<f64> =
+        found.zip(expected).map(|(a, b)| b.between(a).position().norm()).collect();
+    let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+    [mean, errors.into_iter().fold(0.0, f64::max)]
+}
+
+/// A laser that sees 4 m, ten times a second. Odometry errs too.
+#[test]
+fn hector_follows_tinyslams_robot_with_odometry_and_without() {
+    let Some(log) = recorded("tinyslam/exp1.log") else { return };
+    let log = CarmenLog::open(&log).expect("it is a log");
+    for odometry in ["odometry_source=auto", "odometry_source=none"] {
+        let [mean, worst] = motion_errors(&log, &config(&["engine=hector", odometry]));
+        eprintln!("tinyslam, {odometry}: {mean:.3} m in 20 scans, {worst:.3} m at worst");
+        assert!(mean < 0.2 && worst < 0.6, "{odometry}: {mean} m, {worst} m");
+    }
+}
+
+/// The share of the hits of Intel's scans that lie within a cell of an occupied one, in the map
+/// along the poses.
+fn share_on_walls(log: &CarmenLog, pose: impl Fn(&Reading) -> Pose2) -> f64 {
+    let config = config(&["engine=known_poses", "maxUrange=40"]);
+    let mut replay = Replay::new(&config, 1).expect("it needs no thread");
+    let mut hits = Vec::new();
+    for reading in log.readings().expect("it opened before") {
+        let mut reading = reading.expect("it can be read to its end");
+        reading.odom_from_base = pose(&reading);
+        let Some(scan) = &reading.scan else { continue };
+        assert_eq!(replay.add(&reading), Verdict::Processed);
+        for (index, range) in scan.ranges.iter().enumerate() {
+            if let Beam::Hit(range) = scan.geometry.classify(*range) {
+                let end = scan.point_in_base(&reading.mount, index, range);
+                hits.push(reading.odom_from_base * end);
+            }
+        }
+    }
+    let map = replay.finish().map.expect("scans were processed");
+    let is_occupied = |x: f64, y: f64| {
+        let (column, row) = (x.floor(), y.floor());
+        let inside = column >= 0.0 && row >= 0.0 && column < map.width as f64;
+        let index = row as usize * map.width + column as usize;
+        inside && map.cells.get(index) == Some(&100)
+    };
+    let near_wall = |end: &&Point2| {
+        let [x, y] = [end.x - map.origin.x, end.y - map.origin.y].map(|v| v / map.resolution);
+        let near = [-1.0, 0.0, 1.0];
+        near.iter().any(|dy| near.iter().any(|dx| is_occupied(x + dx, y + dy)))
+    };
+    hits.iter().filter(near_wall).count() as f64 / hits.len() as f64
+}
+
+/// Along right poses, scans agree on where walls are; along raw odometry, one scan's wall is
+/// another's free space.
+#[test]
+fn intel_along_published_poses_is_a_map_of_walls() {
+    let (Some(log), Some(poses)) =
+        (recorded("intel/intel.log"), recorded("intel/gmapping-published.txt"))
+    else {
+        return;
+    };
+    let log = CarmenLog::open(&log).expect("it is a log");
+    let poses = GivenPoses::read(&poses).expect("it is a trajectory");
+    let along_reference =
+        share_on_walls(&log, |reading| poses.at(reading.stamp).expect("it is of this log"));
+    let along_odometry = share_on_walls(&log, |reading| reading.odom_from_base);
+    eprintln!("on walls: {along_reference:.3} along poses, {along_odometry:.3} along odometry");
+    assert!(along_reference > 0.95, "{along_reference}");
+    assert!(along_odometry < 0.5, "{along_odometry}");
 }
 
 /// The poses and the hits in the base frame of the processed scans of a log.

@@ -613,15 +613,24 @@ async fn hector_without_odometry_tells_its_transform_and_that_a_corridor_is_weak
     };
     let far = &rig.sessions[1];
     far.declare_subscriber(format!("{ROBOT}/tf")).callback(told).background().await.unwrap();
+    let mut last = None;
     for moment in drive_in(Place::Corridor, 300).iter().skip(200) {
         rig.robot.scan(moment).await;
-        rig.verdict().await;
+        last = rig.verdict().await.weak_direction;
     }
-    let status = rig.daemon.status();
-    assert!(status.filter.weak_directions > 50, "{:?}", status.filter);
-    let weak = status.filter.weak_direction.unwrap();
+    let replies = rig.sessions[1].get(format!("{ROBOT}/slam/status")).await.unwrap();
+    let reply = tokio::time::timeout(PATIENCE, replies.recv_async()).await.unwrap().unwrap();
+    let bytes = reply.result().unwrap().payload().to_bytes();
+    let status: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+    assert_eq!(status["state"], "degraded", "{status}");
+    let detail = status["detail"].as_str().unwrap();
+    assert!(detail.starts_with("the scans do not tell how far it moves along"), "{detail}");
+    assert!(detail.ends_with("and without odometry the map may shrink there"), "{detail}");
+    let filter = &status["filter"];
+    assert!(filter["weak_directions"].as_u64() > Some(50), "{filter}");
+    let weak = last.expect("the verdict tells it, too");
     assert!(weak.x.abs() > 0.9, "the corridor is along x: {weak:?}");
-    assert!(status.detail.contains("corridor"), "{}", status.detail);
+    assert_eq!(filter["weak_direction"], serde_json::to_value(weak).unwrap());
 
     let transform = tokio::time::timeout(PATIENCE, transforms.recv()).await.unwrap().unwrap();
     let frames = (transform.header.frame_id.as_str(), transform.child_frame_id.as_str());
@@ -700,6 +709,37 @@ async fn a_paused_daemon_takes_no_scan_and_goes_on_where_the_robot_is() {
     let driven = moments[0].odom_from_base().between(moments[39].odom_from_base());
     let error = driven.between(way[0].between(way[1]));
     assert!(way.len() == 2 && error.position().norm() < 0.3, "{way:?} {driven:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn other_engines_pause_and_go_on_too() {
+    let moments = drive(20);
+    for engine in ["engine=hector", "engine=known_poses"] {
+        let mut rig = Rig::mounted(&[engine]).await;
+        let poses = rig.daemon.status().inputs.contains_key("pose");
+        for (index, moment) in moments.iter().enumerate() {
+            match index {
+                1 => assert!(rig.command(Command::Pause).await.changed),
+                19 => assert!(rig.command(Command::Resume).await.changed),
+                _ => {}
+            }
+            if poses {
+                rig.robot.put(&rig.robot.odom, &moment.pose_in("map")).await;
+            } else {
+                rig.robot.odometry(moment).await;
+            }
+            rig.robot.scan(moment).await;
+            let paused = (1..19).contains(&index);
+            let expected = if paused { Verdict::Paused } else { Verdict::Processed };
+            assert_eq!(rig.verdict().await.verdict, expected, "{engine}: {index}");
+            let state = rig.daemon.status().state;
+            assert_eq!(state == State::Paused, paused, "{engine}: {state:?}");
+        }
+        let way: Vec<Pose2> = path(&*rig.end().await).iter().map(|(_, pose)| pose).collect();
+        let driven = moments[0].odom_from_base().between(moments[19].odom_from_base());
+        let error = driven.between(way[0].between(way[1]));
+        assert!(way.len() == 2 && error.position().norm() < 0.1, "{way:?} {driven:?}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -166,8 +166,8 @@ enum Odometry {
 
 /// Where the robot is believed and truly is at the far end of the corridor, and the reports of
 /// scans that see neither end.
-fn corridor(odometry: Odometry) -> (f64, f64, Vec<ScanReport>) {
-    let simulation = Simulation::new(&Scenario::new(Place::Corridor, 1)).expect("beams");
+fn corridor(odometry: Odometry, seed: u64) -> (f64, f64, Vec<ScanReport>) {
+    let simulation = Simulation::new(&Scenario::new(Place::Corridor, seed)).expect("beams");
     // Neither end is seen from more than 10 m away.
     let mut hector = Hector::new(Parameters { max_range: 10.0, ..Parameters::default() });
     let (mut far, mut believed, mut amid) = (0.0, 0.0, Vec::new());
@@ -189,19 +189,60 @@ fn corridor(odometry: Odometry) -> (f64, f64, Vec<ScanReport>) {
 
 #[test]
 fn along_a_plain_corridor_odometry_decides_and_the_direction_is_told() {
-    let (far, believed, amid) = corridor(Odometry::Used);
-    println!("{believed} m of {far} m");
-    assert!((believed - far).abs() < 0.01 * far, "{believed} m of {far} m");
-    for report in amid {
-        let weak = report.weak_direction.expect("the scan does not tell how far");
-        assert!(weak.x.abs() > 0.99, "{weak:?}");
+    for seed in [1, 2, 3] {
+        let (far, believed, amid) = corridor(Odometry::Used, seed);
+        println!("{believed} m of {far} m");
+        assert!((believed - far).abs() < 0.01 * far, "seed {seed}: {believed} m of {far} m");
+        assert!(amid.len() > 100, "{} scans see neither end", amid.len());
+        let weak: Vec<_> = amid.iter().filter_map(|report| report.weak_direction).collect();
+        println!("seed {seed}: {} of {} scans leave it open", weak.len(), amid.len());
+        assert!(weak.iter().all(|weak| weak.x.abs() > 0.99), "seed {seed}: {weak:?}");
+        // Wild ranges may look like a wall across.
+        assert!(weak.len() * 100 >= amid.len() * 99, "{} of {}", weak.len(), amid.len());
     }
 }
 
 #[test]
 fn without_odometry_the_corridors_direction_is_told_all_the_same() {
-    let (_, _, amid) = corridor(Odometry::None);
+    let (_, _, amid) = corridor(Odometry::None, 1);
     assert!(amid.len() > 100 && amid.iter().all(|report| report.weak_direction.is_some()));
+}
+
+/// Stamps say nothing then of how far the robot may have got.
+#[test]
+fn without_odometry_backwards_and_repeated_stamps_do_no_harm() {
+    let lidar = full_circle(360);
+    let mut hector = Hector::new(Parameters::default());
+    hector.set_pose(route(CORNER)[0]);
+    for (index, mut shot) in (0..).zip(shots(&room(CORNER), &lidar, &route(CORNER))) {
+        shot.scan.stamp = Stamp(5_000_000_000 - (index / 2) * 100_000_000);
+        let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base: None };
+        report(hector.add_scan(&sweep, &mut |_| ()));
+        let error = shot.odom_from_base.between(hector.pose_in_map());
+        assert!(error.position().norm() < 0.05 && error.theta.abs() < 0.02, "{index}: {error:?}");
+    }
+}
+
+/// Whoever points at a map is off by a hand's breadth.
+#[test]
+fn a_pose_that_is_set_is_doubted_and_two_scans_find_the_true_one() {
+    let lidar = full_circle(360);
+    let drive = shots(&room(CORNER), &lidar, &route(CORNER));
+    for beside in [Pose2::new(0.3, 0.0, 0.2), Pose2::new(0.0, -0.3, -0.2)] {
+        let mut hector = Hector::new(Parameters::default());
+        for (index, shot) in drive.iter().enumerate().take(14) {
+            if index == 12 {
+                hector.set_pose(drive[11].odom_from_base * beside);
+                let covariance = hector.covariance();
+                assert!(covariance[(0, 0)] >= 0.01 && covariance[(2, 2)] >= 0.0025, "{covariance}");
+            }
+            let odom_from_base = Some(shot.odom_from_base);
+            let sweep = Sweep { scan: &shot.scan, mount: &lidar.mount, odom_from_base };
+            assert_eq!(report(hector.add_scan(&sweep, &mut |_| ())).matched, 1);
+        }
+        let error = drive[13].odom_from_base.between(hector.pose_in_map());
+        assert!(error.position().norm() < 0.03 && error.theta.abs() < 0.01, "{error:?}");
+    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Laws of the mapping core: what must hold whatever the scans are.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use gmapd::sim::Simulation;
 use gmapd::sim::building::building;
@@ -16,10 +16,11 @@ use gmapd::slam::grid::hit_map::HitMap;
 use gmapd::slam::grid::likelihood_field::{
     FULL, Kernel, LikelihoodField, Points, Window, WindowPose,
 };
+use gmapd::slam::grid::log_odds::{Evidence, LogOdds, LogOddsMap};
 use gmapd::slam::grid::occupancy::{
     BeamEnd, BeamEndKind, Count, OccupancyGrid, OccupancyMap, ScanOutline,
 };
-use gmapd::slam::grid::tile_map::TILE_SIZE;
+use gmapd::slam::grid::tile_map::{TILE_SIZE, TileKey, TileMap};
 use gmapd::slam::motion_gate::MotionGate;
 use gmapd::slam::path::Path;
 use gmapd::slam::pose::{Point2, Pose2};
@@ -161,14 +162,18 @@ proptest! {
 
 /// The cells that were seen, with their counts.
 fn seen(map: &OccupancyMap) -> BTreeMap<Cell, Count> {
+    known(map.counts())
+}
+
+/// The cells of which something is known, and what.
+fn known<T: Copy + Default + PartialEq>(cells: &TileMap<T>) -> BTreeMap<Cell, T> {
     let size = TILE_SIZE as i32;
-    let tiles = map.counts().tiles();
-    let cells = tiles.flat_map(|(key, tile)| {
+    let cells = cells.tiles().flat_map(|(key, tile)| {
         let first = key.first_cell();
         let cell = move |i: i32| Cell::new(first.ix + i % size, first.iy + i / size);
-        (0..).zip(tile).map(move |(i, count)| (cell(i), *count))
+        (0..).zip(tile).map(move |(i, value)| (cell(i), *value))
     });
-    cells.filter(|(_, count)| *count != Count::default()).collect()
+    cells.filter(|(_, value)| *value != T::default()).collect()
 }
 
 /// Beam ends all around, of any range and kind.
@@ -247,6 +252,102 @@ proptest! {
         map.add(&b, q);
         map.remove(&b, q);
         prop_assert_eq!(seen(&map), before);
+    }
+}
+
+/// The triangles that two neighbouring beams know to be free, in cells of a metre: as long as the
+/// shorter of the two. A full turn has one between its last beam and its first.
+fn wedges(scan: &ScanOutline, pose: Pose2) -> Vec<[Point2; 3]> {
+    let count = scan.ends.len();
+    let closes = (count as f64 + 0.5) * scan.angle_increment >= std::f64::consts::TAU;
+    let pairs = (1..count).map(|i| (i - 1, i)).chain(closes.then_some((count - 1, 0)));
+    let says = |i: &usize| scan.ends[*i].kind != BeamEndKind::Nothing;
+    let sensor = scan.sensor;
+    let arm = |i: usize| {
+        let [x, y] = scan.ends[i].point.map(f64::from);
+        Point2::new(x - sensor.x, y - sensor.y)
+    };
+    pairs
+        .filter(|(a, b)| scan.angle_increment <= 0.6 && says(a) && says(b))
+        .map(|(a, b)| {
+            let arms = [arm(a), arm(b)];
+            let reach = arms[0].norm().min(arms[1].norm());
+            let [a, b] = arms.map(|arm| {
+                let share = reach / arm.norm();
+                Point2::new(sensor.x + share * arm.x, sensor.y + share * arm.y)
+            });
+            [sensor, a, b].map(|corner| pose * corner)
+        })
+        .collect()
+}
+
+/// Whether a point is inside of the triangles: more turn left around it than right, or fewer, for
+/// beams may overlap after a full turn. `None` so near an edge that rounding decides.
+fn is_inside(triangles: &[[Point2; 3]], p: Point2) -> Option<bool> {
+    let mut winding = 0;
+    for &[a, b, c] in triangles {
+        let left_of = |a: Point2, b: Point2| (b.x - a.x) * (p.y - a.y) - (b.y - a.y) * (p.x - a.x);
+        let sides = [left_of(a, b), left_of(b, c), left_of(c, a)];
+        if sides.iter().any(|side| side.abs() < 1e-6) {
+            return None;
+        }
+        winding += i32::from(sides.iter().all(|side| *side > 0.0));
+        winding -= i32::from(sides.iter().all(|side| *side < 0.0));
+    }
+    Some(winding != 0)
+}
+
+proptest! {
+    #[test]
+    fn a_cell_is_free_if_its_centre_is_between_two_beams(scan in outlines(), pose in poses()) {
+        let mut map = OccupancyMap::new(1.0);
+        // A cell of a metre is as good as one of a few centimetres, and quicker.
+        let scan = ScanOutline {
+            sensor: Point2::new(5.0 * scan.sensor.x, 5.0 * scan.sensor.y),
+            ends: scan
+                .ends
+                .iter()
+                .map(|end| BeamEnd { point: end.point.map(|v| 5.0 * v), ..*end })
+                .collect(),
+            ..scan
+        };
+        map.add(&scan, pose);
+        let wedges = wedges(&scan, pose);
+        let middle = Cell::containing(pose.position(), 1.0);
+        for (dx, dy) in (-40..=40).flat_map(|dy| (-40..=40).map(move |dx| (dx, dy))) {
+            let cell = Cell::new(middle.ix + dx, middle.iy + dy);
+            let count = map.counts().get(cell);
+            let centre = Point2::new(f64::from(cell.ix) + 0.5, f64::from(cell.iy) + 0.5);
+            if let Some(inside) = is_inside(&wedges, centre).filter(|_| count.hits == 0) {
+                prop_assert_eq!(count.visits == 1, inside, "{:?}", cell);
+            }
+        }
+    }
+
+    /// Each cell once a scan, an obstacle before free space; and whoever keeps the tiles is told.
+    #[test]
+    fn log_odds_add_up_what_the_counts_of_each_scan_say(
+        scans in vec((outlines(), -1.0..1.0, -3.1..3.1), 1..5),
+        near in poses(),
+    ) {
+        let [free, occupied] = [0.4, 0.9].map(LogOdds::of_probability);
+        let mut map = LogOddsMap::new(0.05);
+        let mut expected: BTreeMap<Cell, LogOdds> = BTreeMap::new();
+        let mut touched = BTreeSet::new();
+        for (scan, beside, turn) in &scans {
+            let pose = near * Pose2::new(*beside, -*beside, *turn);
+            map.add(scan, pose, Evidence { free, occupied }, |tile| touched.extend([tile]));
+            let mut counts = OccupancyMap::new(0.05);
+            counts.add(scan, pose);
+            for (cell, count) in seen(&counts) {
+                let value = expected.entry(cell).or_default();
+                *value = value.and(if count.hits > 0 { occupied } else { free });
+            }
+        }
+        expected.retain(|_, value| *value != LogOdds::default());
+        let tiles: BTreeSet<TileKey> = expected.keys().map(|c| TileKey::containing(*c)).collect();
+        prop_assert!(tiles.is_subset(&touched));
+        prop_assert_eq!(known(map.cells()), expected);
     }
 }
 

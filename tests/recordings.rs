@@ -56,6 +56,7 @@ fn simulated_log(directory: &TempDir) -> PathBuf {
 enum Told {
     Messages,
     Transforms,
+    NotAtAll,
 }
 
 /// Writes messages as a robot sends them.
@@ -99,10 +100,10 @@ impl Robot {
                 self.send("tf_static", stamp, &mount);
             }
             let Messages { odometry, scan } = self.frames.messages(&reading);
-            if odometry_as == Told::Transforms {
-                self.send("tf", stamp, &transform_of(odometry));
-            } else {
-                self.send("odom", stamp, &odometry);
+            match odometry_as {
+                Told::Messages => self.send("odom", stamp, &odometry),
+                Told::Transforms => self.send("tf", stamp, &transform_of(odometry)),
+                Told::NotAtAll => {}
             }
             if let Some(scan) = scan {
                 self.send("scan", stamp, &scan);
@@ -177,6 +178,39 @@ fn odometry_from_transforms_gives_the_same_map() {
     let recorded = open(&path, &Wanted::default()).expect("it is whole");
     let frames = recorded.frames();
     assert_eq!((frames.odom.as_str(), frames.base.as_str()), ("world", "foot"));
+}
+
+/// As in the daemon, scans go without odometry where none comes, if the engine can do without.
+#[test]
+fn odometry_that_ends_stops_hector_no_more_than_the_daemon() {
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let mut robot = Robot::create(&directory.path().join("ends.mcap"), "");
+    robot.drive(&log, 0..60, Told::Messages);
+    robot.drive(&log, 60..120, Told::NotAtAll);
+    let path = robot.finish();
+    let (refused, _) = replay(&[text(&path)]);
+    let readings = &refused["readings"];
+    assert_eq!(readings["refused"], 60, "{readings}");
+    let (mapped, _) = replay(&[text(&path), "--engine", "hector"]);
+    let readings = &mapped["readings"];
+    assert_eq!((&readings["processed"], &readings["refused"]), (&120.into(), &0.into()));
+}
+
+#[test]
+fn a_recording_without_odometry_is_for_hector_alone() {
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let mut robot = Robot::create(&directory.path().join("scans.mcap"), "");
+    robot.drive(&log, 0..60, Told::NotAtAll);
+    let path = robot.finish();
+    let refused = gmapd(&["replay", text(&path)]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(stderr(&refused).contains("it has no odometry"), "{}", stderr(&refused));
+    let (mapped, _) = replay(&[text(&path), "--engine", "hector"]);
+    assert_eq!(mapped["readings"]["processed"], 60, "{mapped}");
+    let (alone, _) = replay(&[text(&path), "--engine", "hector", "--set", "odometry_source=none"]);
+    assert_eq!(mapped["sha256"], alone["sha256"]);
 }
 
 #[test]

@@ -66,6 +66,26 @@ fn room_log() -> String {
     log
 }
 
+/// The same drive with a laser 0.3 m ahead of the base and odometry that bends; the poses of the
+/// laser are `corrected`.
+fn bent_log(corrected: impl Fn(f64) -> [f64; 3]) -> String {
+    let mut log = "PARAM robot_frontlaser_offset 0.3 nohost 0\n".to_owned();
+    for step in 0..=16 {
+        let x = f64::from(step) * 0.25;
+        let (odom_y, odom_yaw) = (0.1 * x * x, 0.2 * x);
+        let [laser_x, laser_y, laser_yaw] = corrected(x);
+        log.push_str("FLASER 181");
+        for beam in 0..181 {
+            let angle = (f64::from(beam) - 90.0).to_radians();
+            write!(log, " {:.3}", range_in_room(2.3 + x, 3.0, angle)).expect("memory suffices");
+        }
+        let stamp = 100.0 + f64::from(step) * 0.5;
+        let poses = format!("{laser_x} {laser_y} {laser_yaw} {x} {odom_y} {odom_yaw}");
+        writeln!(log, " {poses} {stamp:.6} host 0").expect("memory suffices");
+    }
+    log
+}
+
 fn range_in_room(x: f64, y: f64, angle: f64) -> f64 {
     let along = |position: f64, direction: f64, size: f64| {
         if direction > 0.0 { (size - position) / direction } else { position / -direction }
@@ -177,6 +197,65 @@ fn jumps_of_odometry_are_rejected_and_counted() {
     assert_eq!(rejected["readings"]["jump_rejected"], 2);
     let believed = summary(&[text(&log), "--set", "jump_policy=continue"]);
     assert_eq!(believed["readings"]["jump_rejected"], 0);
+}
+
+#[test]
+fn known_poses_are_those_that_the_log_was_corrected_to_or_those_of_a_file() {
+    let directory = directory();
+    let true_laser = |x| [x + 0.3, 0.0, 0.0];
+    let log = file(&directory, "corrected.log", bent_log(true_laser).as_bytes());
+    let out = directory.path().join("out");
+    let run =
+        gmapd(&["replay", text(&log), "--engine", "known_poses", "--out", text(&out), "--json"]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert!(!run.stderr.contains("--poses"), "{}", run.stderr);
+    let corrected: Value = serde_json::from_str(&run.stdout).expect("--json prints JSON");
+    assert_eq!(corrected["readings"]["processed"], 17);
+    // The base drives straight on, from the origin to 4 m.
+    let trajectory = fs::read_to_string(out.join("trajectory.tum")).expect("it was written");
+    let last: Vec<f64> = trajectory
+        .lines()
+        .last()
+        .expect("it has poses")
+        .split(' ')
+        .map(|field| field.parse().expect("a number"))
+        .collect();
+    assert!((last[1] - 4.0).abs() < 1e-6 && last[2].abs() < 1e-6, "{last:?}");
+
+    let poses: String = (0..=16)
+        .map(|step| format!("{} {} 0 0\n", 100.0 + 0.5 * f64::from(step), 0.25 * f64::from(step)))
+        .collect();
+    let poses = file(&directory, "poses.txt", poses.as_bytes());
+    let given = summary(&[text(&log), "--engine", "known_poses", "--poses", text(&poses)]);
+    assert_eq!(given["sha256"], corrected["sha256"]);
+    let by_odometry = summary(&[text(&log)]);
+    assert_ne!(by_odometry["sha256"]["map.pgm"], corrected["sha256"]["map.pgm"]);
+}
+
+#[test]
+fn a_scan_outside_of_the_given_poses_is_refused_by_how_much() {
+    let directory = directory();
+    let log = file(&directory, "corrected.log", bent_log(|x| [x + 0.3, 0.0, 0.0]).as_bytes());
+    let poses = file(&directory, "poses.txt", b"100 0 0 0\n107.25 3.625 0 0\n");
+    let arguments = [text(&log), "--engine", "known_poses", "--poses", text(&poses)];
+    let run = gmapd(&[&["replay", "--json"], &arguments[..]].concat());
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let told = "2 scans could not be used; of the last of them: no pose is given for it: the last is \
+                750.0 ms older";
+    assert!(run.stderr.contains(told), "{}", run.stderr);
+    let summary: Value = serde_json::from_str(&run.stdout).expect("--json prints JSON");
+    let readings = &summary["readings"];
+    assert_eq!((&readings["processed"], &readings["refused"]), (&15.into(), &2.into()));
+}
+
+#[test]
+fn a_log_whose_poses_were_not_corrected_is_told_for_what_it_is() {
+    let directory = directory();
+    let log = file(&directory, "room.log", room_log().as_bytes());
+    let run = gmapd(&["replay", text(&log), "--engine", "known_poses"]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let told = "room.log no pose is corrected: the map is along odometry; --poses FILE";
+    assert!(run.stderr.contains(told), "{}", run.stderr);
 }
 
 #[test]

@@ -744,7 +744,7 @@ async fn a_checkpoint_can_be_asked_for_and_holds_what_was_commanded() {
     assert!(done.contains("checkpoint-0000000001.state"), "{done}");
     let [path] = [checkpoints(&mesh.state("robot01")).remove(0).1];
     let text = info(&path, &[]);
-    for part in ["good", "robot01", "gmapping, 4 hypotheses", "cells of 0.05 m", "format 1"] {
+    for part in ["good", "robot01", "gmapping, 4 hypotheses", "cells of 0.05 m", "format 2"] {
         assert!(text.contains(part), "{part}: {text}");
     }
     // What a command changed is written at once.

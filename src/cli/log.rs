@@ -109,6 +109,20 @@ impl Log {
             }
         }
     }
+
+    /// Tells if the poses that a CARMEN log has for its scans are none but odometry's.
+    pub(super) fn warn_of_odometry(&self, path: &Path) -> Result<(), LogError> {
+        if let Self::Carmen(log) = self
+            && !log.has_corrected_poses()?
+        {
+            eprintln!(
+                "warning: in {} no pose is corrected: the map is along odometry; --poses FILE gives \
+                 other poses",
+                path.display()
+            );
+        }
+        Ok(())
+    }
 }
 
 /// CARMEN's scans do not say how long a sweep takes; the configuration may.

@@ -103,7 +103,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let watch = Stopwatch::start();
     let outcome = match poses(arguments, &config)? {
         Poses::Odometry => along(Along::Odometry, &log, &config, replay)?,
-        Poses::OfLog => along(Along::CorrectedPoses, &log, &config, replay)?,
+        Poses::OfLog => {
+            log.warn_of_odometry(&arguments.log)?;
+            along(Along::CorrectedPoses, &log, &config, replay)?
+        }
         Poses::Given(poses) => along_given_poses(&log, &config, replay, &poses)?,
     };
     let elapsed = watch.elapsed();
@@ -172,6 +175,10 @@ fn along(poses: Along, log: &Log, config: &Config, mut replay: Replay) -> anyhow
                 add(&mut replay, log, config, &reading);
                 progress.advance(reading.stamp);
             }
+            Event::ScanAlone(scan, mount) => {
+                replay.add_scan_alone(&scan, &mount);
+                progress.advance(scan.stamp);
+            }
             Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
     }
@@ -205,6 +212,8 @@ fn along_given_poses(
                     Err(_) => {}
                 }
             }
+            // The file says where it was taken, whatever the log says.
+            Event::ScanAlone(..) => {}
             Event::Refused(refusal) => refuse(&mut replay, &mut refusals, refusal),
         }
     }

@@ -57,7 +57,7 @@ impl Config {
             source::add_file(&mut entries, &mut warnings, path, &text)?;
         }
         for text in overrides {
-            source::add_override(&mut entries, text)?;
+            source::add_override(&mut entries, &mut warnings, text)?;
         }
         let raw = check::resolve(&entries)?;
         warnings.extend(warnings_about(&entries, &raw));

@@ -225,7 +225,7 @@ pub(super) const HECTOR_KEYS: [(&str, &str); 27] = [
     ("scan_subscriber_queue_size", "scan_queue takes its place"),
     ("scan_topic", "keys takes its place"),
     ("sys_msg_topic", "slam/cmd/reset takes its place"),
-    ("pose_update_topic", "the pose is published on slam/pose"),
+    ("pose_update_topic", "the pose is published on pose"),
     ("use_tf_scan_transformation", "the laser's mount is always used"),
     ("use_tf_pose_start_estimate", "odometry is used where there is some"),
     ("map_with_known_poses", "it is an engine of its own"),
@@ -393,6 +393,18 @@ pub enum EngineKind {
     Hector,
     /// Mapping along poses that somebody else knows.
     KnownPoses,
+}
+
+impl EngineKind {
+    /// Whether scans without odometry, or without the pose that stands in its place, are of no use
+    /// to it.
+    #[must_use]
+    pub const fn needs_odometry(self) -> bool {
+        match self {
+            Self::Gmapping | Self::KnownPoses => true,
+            Self::Hector => false,
+        }
+    }
 }
 
 /// Where the first scan was taken.

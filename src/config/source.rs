@@ -23,6 +23,9 @@ const ROS_PARAMETERS: &str = "ros__parameters";
 const FOREIGN_KEYS: [&str; 4] =
     ["use_sim_time", "qos_overrides", "start_type_description_service", "inverted_laser"];
 
+/// With this, hector_mapping matches nothing.
+const KNOWN_POSES: &str = "map_with_known_poses";
+
 /// Where a value was given.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origin {
@@ -71,22 +74,42 @@ pub(super) fn add_file(
     let Some(document) = document else { return Ok(()) };
     let parameters = unnest(into_map(document, path)?, path, warnings)?;
     for (key, node) in parameters {
-        if FOREIGN_KEYS.contains(&key.as_str()) {
-            warnings.push(ConfigWarning::Foreign { key });
-            continue;
-        }
-        if let Some((_, instead)) = HECTOR_KEYS.iter().find(|(name, _)| *name == key) {
-            warnings.push(ConfigWarning::Hectors { key, instead });
-            continue;
-        }
         let origin = Origin::File { path: path.to_owned(), line: node.referenced.line() };
-        entries.insert(key, Entry { value: node.value.into_value(), origin });
+        let entry = Entry { value: node.value.into_value(), origin };
+        add(entries, warnings, key, entry)?;
+    }
+    Ok(())
+}
+
+/// Adds a key, or warns that it means nothing here.
+fn add(
+    entries: &mut Entries,
+    warnings: &mut Vec<ConfigWarning>,
+    key: String,
+    entry: Entry,
+) -> Result<(), ConfigError> {
+    if key == KNOWN_POSES && entry.value == Value::Bool(true) {
+        let reason = "mapping along known poses is another engine: leave this out, and set \
+                      `engine: known_poses`";
+        let (value, reason) = (entry.value.to_string(), reason.to_owned());
+        return Err(ConfigError::WrongKind { origin: entry.origin, key, value, reason });
+    }
+    if FOREIGN_KEYS.contains(&key.as_str()) {
+        warnings.push(ConfigWarning::Foreign { key });
+    } else if let Some((_, instead)) = HECTOR_KEYS.iter().find(|(name, _)| *name == key) {
+        warnings.push(ConfigWarning::Hectors { key, instead });
+    } else {
+        entries.insert(key, entry);
     }
     Ok(())
 }
 
 /// Adds the key of one `key=value`.
-pub(super) fn add_override(entries: &mut Entries, text: &str) -> Result<(), ConfigError> {
+pub(super) fn add_override(
+    entries: &mut Entries,
+    warnings: &mut Vec<ConfigWarning>,
+    text: &str,
+) -> Result<(), ConfigError> {
     let (key, value) =
         text.split_once('=').ok_or_else(|| ConfigError::NotKeyValue { text: text.to_owned() })?;
     let node: Node = parse(value).map_err(|error| ConfigError::Syntax {
@@ -94,8 +117,7 @@ pub(super) fn add_override(entries: &mut Entries, text: &str) -> Result<(), Conf
         reason: format!("{key}={value}: {}", plain_message(&error)),
     })?;
     let entry = Entry { value: node.into_value(), origin: Origin::Override };
-    entries.insert(key.trim().to_owned(), entry);
-    Ok(())
+    add(entries, warnings, key.trim().to_owned(), entry)
 }
 
 /// Repeated keys and NaN are left to [`NodeVisitor`], which says so in the file's words.

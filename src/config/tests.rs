@@ -213,6 +213,98 @@ fn keys_without_effect_are_accepted_and_said_to_have_none() {
     assert_eq!(warnings("amcl: {a: 1}\nslam_gmapping: {particles: 3}\n").len(), 1);
 }
 
+/// All parameters of hector_mapping and of its trajectory server, with their defaults.
+const HECTOR_MAPPING: &str = "\
+hector_mapping:
+  pub_drawings: false
+  pub_debug_output: false
+  pub_map_odom_transform: true
+  pub_odometry: false
+  advertise_map_service: true
+  scan_subscriber_queue_size: 5
+  map_resolution: 0.025
+  map_size: 1024
+  map_start_x: 0.5
+  map_start_y: 0.5
+  map_multi_res_levels: 3
+  update_factor_free: 0.4
+  update_factor_occupied: 0.9
+  map_update_distance_thresh: 0.4
+  map_update_angle_thresh: 0.9
+  scan_topic: scan
+  sys_msg_topic: syscommand
+  pose_update_topic: poseupdate
+  use_tf_scan_transformation: true
+  use_tf_pose_start_estimate: false
+  map_with_known_poses: false
+  base_frame: base_link
+  map_frame: map
+  odom_frame: odom
+  pub_map_scanmatch_transform: true
+  tf_map_scanmatch_transform_frame_name: scanmatcher_frame
+  output_timing: false
+  map_pub_period: 2.0
+  laser_min_dist: 0.4
+  laser_max_dist: 30.0
+  laser_z_min_value: -1.0
+  laser_z_max_value: 1.0
+  target_frame_name: map
+  source_frame_name: base_link
+  trajectory_update_rate: 4.0
+  trajectory_publish_rate: 0.25
+hector_geotiff_node:
+  map_file_path: .
+  geotiff_save_period: 0.0
+";
+
+#[test]
+fn a_whole_file_of_hector_mapping_loads_and_has_the_defaults() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("hector.yaml");
+    std::fs::write(&path, HECTOR_MAPPING).unwrap();
+    let hector = ["engine=hector".to_owned()];
+    let config = Config::load(Some(&path), &hector).unwrap();
+    assert_eq!(config.raw, Config::load(None, &hector).unwrap().raw);
+    let hector = config.hector_parameters();
+    assert_eq!((hector.resolution, hector.levels), (0.025, 3));
+    assert_eq!((hector.free_probability, hector.occupied_probability), (0.4, 0.9));
+    assert_eq!((hector.update_distance, hector.update_angle), (0.4, 0.9));
+    assert_eq!((hector.min_range, hector.max_range), (0.4, 30.0));
+    let RawConfig { base_frame, map_frame, odom_frame, .. } = &config.raw;
+    assert_eq!([base_frame, map_frame, odom_frame], ["base_link", "map", "odom"]);
+
+    // Each of its keys has an effect, or is said to have none.
+    let known = check::known_keys();
+    let (own, _) = HECTOR_MAPPING.split_once("hector_geotiff_node").unwrap();
+    let keys = own.lines().filter(|line| line.starts_with(' '));
+    for (key, _) in keys.map(|line| line.trim().split_once(':').unwrap()) {
+        let told = |warning: &ConfigWarning| matches!(warning, ConfigWarning::Hectors { key: told, .. } if told == key);
+        let known = known.iter().any(|other| other == key);
+        assert_eq!(config.warnings.iter().any(told), !known, "{key}");
+    }
+    let other = ConfigWarning::OtherNode { name: "hector_geotiff_node".to_owned() };
+    assert_eq!((config.warnings.len(), config.warnings.contains(&other)), (26, true));
+}
+
+#[test]
+fn a_key_of_hector_mapping_without_effect_is_told_wherever_it_is_set() {
+    let config = Config::load(None, &["map_size=2048".to_owned()]).unwrap();
+    let warnings: Vec<String> = config.warnings.iter().map(ToString::to_string).collect();
+    let expected = "map_size of hector_mapping has no effect: the map grows without limit";
+    assert_eq!(warnings, [expected]);
+    assert_eq!(warnings, self::warnings("map_size: 2048\n"));
+}
+
+#[test]
+fn hector_mappings_switch_for_known_poses_is_an_error_that_names_the_engine() {
+    let expected = "map_with_known_poses is true: mapping along known poses is another engine: \
+                    leave this out, and set `engine: known_poses`";
+    assert_eq!(set_message("map_with_known_poses=true"), format!("--set: {expected}"));
+    let file = "hector_mapping:\n  map_with_known_poses: true\n";
+    assert_eq!(message(file), format!("gmapd.yaml:2: {expected}"));
+    assert_eq!(warnings("map_with_known_poses: false\n").len(), 1);
+}
+
 #[test]
 fn parameters_of_the_compat_matcher_warn_with_the_field_matcher_only() {
     assert_eq!(

@@ -66,6 +66,10 @@ fn a_scan_survives_messages_but_for_the_digits_of_its_angles() {
 fn an_unusable_scan_is_an_error() {
     let error = scan(ros::LaserScan { angle_increment: 0.0, ..laser_scan_message() }).unwrap_err();
     assert_eq!(error, ConvertError::Geometry(GeometryError::Increment(0.0)));
+    for time_increment in [f32::NAN, f32::INFINITY] {
+        let error = scan(ros::LaserScan { time_increment, ..laser_scan_message() }).unwrap_err();
+        assert!(error.to_string().contains("field time_increment is"), "{error}");
+    }
     let mut late = laser_scan_message();
     late.header.stamp.nanosec = 1_000_000_000;
     assert_eq!(

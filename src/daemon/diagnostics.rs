@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::snapshot::State;
 use super::status::Status;
 use crate::ros;
+use crate::slam::update::WeakDirection;
 
 /// The status of the robot as a message; its stamp is zero, for no sensor took it.
 pub(super) fn diagnostics(status: &Status, robot: &str) -> ros::DiagnosticArray {
@@ -34,6 +35,8 @@ fn values(status: &Status) -> Vec<ros::KeyValue> {
         value("ms per scan, 99 of 100", known(milliseconds.map(|spread| spread.p99))),
         value("particles", status.filter.particles.to_string()),
         value("effective sample size", known(status.filter.effective_sample_size)),
+        value("weak direction", weak_direction(status.filter.weak_direction)),
+        value("scans with a weak direction", status.filter.weak_directions.to_string()),
     ];
     let counts = status.scans.iter();
     values.extend(
@@ -41,6 +44,13 @@ fn values(status: &Status) -> Vec<ros::KeyValue> {
             .map(|(verdict, count)| value(&format!("scans {}", word(verdict)), count.to_string())),
     );
     values
+}
+
+/// What the last processed scan left open, in words.
+fn weak_direction(weak: Option<WeakDirection>) -> String {
+    weak.map_or("none".to_owned(), |WeakDirection { x, y, turn }| {
+        format!("x {x:.2}, y {y:.2}, turn {turn:.2}")
+    })
 }
 
 /// The word that `slam/status` has for it.
@@ -99,6 +109,12 @@ mod tests {
     }
 
     #[test]
+    fn a_weak_direction_is_a_value() {
+        let weak = WeakDirection { x: 0.6, y: -0.8, turn: 0.0 };
+        assert_eq!(weak_direction(Some(weak)), "x 0.60, y -0.80, turn 0.00");
+    }
+
+    #[test]
     fn figures_and_counts_are_values() {
         let message = diagnostics(&status(State::Mapping), "robot01");
         let status = &message.status[0];
@@ -112,6 +128,7 @@ mod tests {
         assert_eq!(value("state"), Some("mapping"));
         assert_eq!(value("ms per scan, median"), Some("1.25"));
         assert_eq!(value("effective sample size"), Some("not known"));
+        assert_eq!(value("weak direction"), Some("none"));
         assert_eq!(value("scans processed"), Some("3"));
         assert_eq!(value("scans no_odometry"), Some("2"));
     }

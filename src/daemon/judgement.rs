@@ -6,6 +6,7 @@ use super::ledger::Verdict;
 use super::mapper::Gauges;
 use super::snapshot::{Snapshot, State};
 use super::status::InputStatus;
+use crate::config::EngineKind;
 use crate::slam::known_map::Mode;
 use crate::slam::update::WeakDirection;
 
@@ -24,6 +25,7 @@ const MATCHES: usize = 10;
 /// What the judgement depends on.
 #[derive(Debug)]
 pub(super) struct Circumstances<'a> {
+    pub(super) engine: EngineKind,
     pub(super) uptime_s: f64,
     pub(super) inputs: &'a BTreeMap<&'static str, InputStatus>,
     pub(super) snapshot: &'a Snapshot,
@@ -120,16 +122,24 @@ fn no_match(now: &Circumstances<'_>) -> Option<(State, String)> {
     if shares.len() < MATCHES || mean >= MOSTLY {
         return None;
     }
-    let detail = format!(
-        "the last {MATCHES} scans matched the maps of {:.0} % of the particles, and the others \
-         went by odometry; is minimumScore too high, or the laser mounted otherwise?",
-        mean * 100.0
-    );
+    let percent = mean * 100.0;
+    let detail = match now.engine {
+        EngineKind::Hector => format!(
+            "of the last {MATCHES} scans {percent:.0} % fit the map, and the others do not enter \
+             it; was the robot carried away (slam/cmd/initial_pose says where to), or is the laser \
+             mounted otherwise?"
+        ),
+        EngineKind::Gmapping | EngineKind::KnownPoses => format!(
+            "the last {MATCHES} scans matched the maps of {percent:.0} % of the particles, and the \
+             others went by odometry; is minimumScore too high, or the laser mounted otherwise?"
+        ),
+    };
     Some((State::Degraded, detail))
 }
 
 fn weak_direction(now: &Circumstances<'_>) -> Option<(State, String)> {
-    let WeakDirection { x, y, turn } = (*now.gauges.weakness.back()?)?;
+    let report = now.snapshot.estimate.report.as_ref()?;
+    let WeakDirection { x, y, turn } = report.weak_direction?;
     let what = if turn.abs() > x.abs().max(y.abs()) {
         "how far the robot turns".to_owned()
     } else {
@@ -179,12 +189,23 @@ mod tests {
     use super::super::ledger::Ledger;
     use super::super::mapper::first_snapshot;
     use super::*;
+    use crate::slam::update::ScanReport;
 
     /// What is judged of a daemon that runs for five seconds and heard a scan so long ago.
     fn judged(
         age_s: Option<f64>,
         verdicts: &[(Verdict, usize)],
         change: impl Fn(&mut Gauges),
+    ) -> (State, String) {
+        judged_of(EngineKind::Gmapping, age_s, verdicts, |_, gauges| change(gauges))
+    }
+
+    /// The same of an engine, and of what it left in the snapshot.
+    fn judged_of(
+        engine: EngineKind,
+        age_s: Option<f64>,
+        verdicts: &[(Verdict, usize)],
+        change: impl Fn(&mut Snapshot, &mut Gauges),
     ) -> (State, String) {
         let key = "robot01/scan".to_owned();
         let scan = InputStatus { key, received: 7, age_s, ..InputStatus::default() };
@@ -198,10 +219,11 @@ mod tests {
             }
         }
         snapshot.ledger = ledger;
-        change(&mut gauges);
+        change(&mut snapshot, &mut gauges);
         let inputs = BTreeMap::from([("scan", scan)]);
         let snapshot = Arc::new(snapshot);
         judge(&Circumstances {
+            engine,
             uptime_s: 5.0,
             inputs: &inputs,
             snapshot: &snapshot,
@@ -255,6 +277,49 @@ mod tests {
             judged(Some(0.1), &[(Verdict::Processed, 10)], matched).0
         };
         assert_eq!((state(0.3), state(0.9)), (State::Degraded, State::Mapping));
+    }
+
+    #[test]
+    fn hectors_scans_that_do_not_match_are_told_in_its_words() {
+        let (state, detail) =
+            judged_of(EngineKind::Hector, Some(0.1), &[(Verdict::Processed, 10)], |_, gauges| {
+                gauges.matched = [1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0].into();
+            });
+        assert_eq!(state, State::Degraded);
+        assert!(detail.starts_with("of the last 10 scans 20 % fit the map"), "{detail}");
+        assert!(!detail.contains("particles") && !detail.contains("minimumScore"), "{detail}");
+    }
+
+    /// What is said of Hector if its last scan left this direction open.
+    fn weakly(direction: [f64; 3], change: impl Fn(&mut Snapshot)) -> (State, String) {
+        let [x, y, turn] = direction;
+        let report = ScanReport {
+            hits: 90,
+            matched: 1,
+            best_score: 80.0,
+            effective_sample_size: 1.0,
+            entropy: 0.0,
+            resampled: false,
+            registered: true,
+            weak_direction: Some(WeakDirection { x, y, turn }),
+        };
+        judged_of(EngineKind::Hector, Some(0.1), &[(Verdict::Processed, 9)], |snapshot, _| {
+            snapshot.estimate.report = Some(report.clone());
+            change(snapshot);
+        })
+    }
+
+    #[test]
+    fn a_direction_that_the_scans_leave_open_is_told() {
+        let expected = "the scans do not tell how far it moves along the direction (0.80, -0.60) of \
+                        the map, as in a plain corridor: there odometry alone decides";
+        assert_eq!(weakly([0.8, -0.6, 0.0], |_| ()), (State::Mapping, expected.to_owned()));
+        let (_, detail) = weakly([0.1, 0.1, 0.99], |_| ());
+        assert!(detail.starts_with("the scans do not tell how far the robot turns"), "{detail}");
+        let alone = |snapshot: &mut Snapshot| snapshot.estimate.has_odometry = false;
+        let (state, detail) = weakly([0.8, -0.6, 0.0], alone);
+        assert_eq!(state, State::Degraded);
+        assert!(detail.ends_with("and without odometry the map may shrink there"), "{detail}");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::pose::Stamp;
-use crate::slam::update::SkipReason;
+use crate::slam::update::{SkipReason, WeakDirection};
 
 /// What became of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -88,6 +88,8 @@ pub struct Entry {
     pub verdict: Verdict,
     /// What is wrong and what to do, in a sentence; empty where nothing is.
     pub detail: String,
+    /// What a processed scan left open: a unit vector in `map`; `None` if nothing.
+    pub weak_direction: Option<WeakDirection>,
 }
 
 /// The verdicts so far; cheap to copy, for every snapshot has one.
@@ -123,9 +125,23 @@ impl From<Counted> for Ledger {
 impl Ledger {
     /// Enters a verdict and returns its entry.
     pub fn enter(&mut self, stamp: Option<Stamp>, verdict: Verdict, detail: String) -> &Entry {
+        self.add(Entry { number: self.total + 1, stamp, verdict, detail, weak_direction: None })
+    }
+
+    /// Enters a scan that was processed, with what it left open, and returns its entry.
+    pub fn enter_processed(
+        &mut self,
+        stamp: Stamp,
+        weak_direction: Option<WeakDirection>,
+    ) -> &Entry {
+        let (number, verdict, detail) = (self.total + 1, Verdict::Processed, String::new());
+        self.add(Entry { number, stamp: Some(stamp), verdict, detail, weak_direction })
+    }
+
+    fn add(&mut self, entry: Entry) -> &Entry {
+        let verdict = entry.verdict;
         *Arc::make_mut(&mut self.counts).entry(verdict).or_default() += 1;
         self.total += 1;
-        let entry = Entry { number: self.total, stamp, verdict, detail };
         let last = Arc::make_mut(&mut self.last);
         last.insert(verdict, entry);
         &last[&verdict]

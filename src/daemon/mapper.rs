@@ -28,7 +28,7 @@ use crate::slam::known_map::Mode;
 use crate::slam::odometry::JumpGuard;
 use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::scan::LaserMount;
-use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate, WeakDirection};
+use crate::slam::update::{OdometryUpdate, ScanReport, ScanUpdate};
 use crate::starting::{self, StartError};
 use crate::statistics::Spread;
 use crate::tf::{Kind, TfCounts, Transform};
@@ -91,8 +91,6 @@ pub struct Gauges {
     pub without_odometry: u64,
     /// Processed scans that left a direction open.
     pub weak: u64,
-    /// What the last processed scans left open, oldest first.
-    pub weakness: VecDeque<Option<WeakDirection>>,
     /// Seconds of driving mapped, by the stamps of processed scans.
     pub mapped_s: f64,
     /// Seconds that the filter worked for it.
@@ -208,7 +206,8 @@ impl Mapper {
         let config = &config.with_poses_as_odometry();
         let parameters = config.parameters();
         let engine = starting::engine(config, threads)?;
-        let need = if engine.needs_odometry() { Need::Required } else { Need::Optional };
+        let needed = config.raw.engine.needs_odometry();
+        let need = if needed { Need::Required } else { Need::Optional };
         let mut mapper = Self {
             connections,
             initial_pose: config.raw.initial_pose,
@@ -413,8 +412,10 @@ impl Mapper {
         match self.engine.add_scan(&sweep, &mut |_| ()) {
             ScanUpdate::Processed(report) => {
                 self.count_time(watch.elapsed().wall, scan.stamp);
+                let weak_direction = report.weak_direction;
                 self.processed(scan.stamp, report);
-                self.enter(Some(scan.stamp), Verdict::Processed, String::new());
+                self.view.ledger.enter_processed(scan.stamp, weak_direction);
+                self.tell(Verdict::Processed);
             }
             ScanUpdate::Skipped(reason) => {
                 let verdict = Verdict::from(reason);
@@ -452,7 +453,6 @@ impl Mapper {
         self.view.estimate.covariance = self.engine.covariance();
         let registered = report.registered;
         self.gauges.weak += u64::from(report.weak_direction.is_some());
-        push_bounded(&mut self.gauges.weakness, report.weak_direction, RECENT);
         self.view.estimate.report = Some(report);
         self.renew_estimate(Some(stamp));
         // A map that stays as it is has a longer path.
@@ -500,10 +500,17 @@ impl Mapper {
     }
 
     fn enter(&mut self, stamp: Option<Stamp>, verdict: Verdict, detail: String) {
+        self.view.ledger.enter(stamp, verdict, detail);
+        self.tell(verdict);
+    }
+
+    /// Has the last entry of a verdict told.
+    fn tell(&mut self, verdict: Verdict) {
         self.view.changed = true;
-        let entry = self.view.ledger.enter(stamp, verdict, detail);
-        tracing::trace!(number = entry.number, ?verdict, detail = entry.detail, "scan");
-        self.untold.push(entry.clone());
+        if let Some(entry) = self.view.ledger.last().get(&verdict) {
+            tracing::trace!(number = entry.number, ?verdict, detail = entry.detail, "scan");
+            self.untold.push(entry.clone());
+        }
         push_bounded(&mut self.gauges.recent, verdict, RECENT);
     }
 
@@ -578,7 +585,6 @@ impl Mapper {
         self.view.version = before.version + 1;
         self.view.first_epoch = epoch;
         self.gauges.matched.clear();
-        self.gauges.weakness.clear();
         self.show_start();
         self.renew_estimate(None);
         let at = match pose_in_map {
@@ -702,7 +708,8 @@ enum Flow {
 fn detail(verdict: Verdict, ready: &ReadyScan) -> String {
     match verdict {
         Verdict::NoUsableBeams => format!(
-            "none of its {} beams ends within range_max and maxUrange or laser_max_dist",
+            "none of its {} beams ends between range_min and range_max and within maxUrange, or \
+             with Hector between laser_min_dist and laser_max_dist",
             ready.scan.ranges.len()
         ),
         Verdict::BadOdometry => {

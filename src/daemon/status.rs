@@ -115,6 +115,9 @@ pub struct FilterStatus {
     pub odometry_jumps: u64,
     /// Times odometry began anew after a restart, as after a power cut; 1 at most.
     pub odometry_restarts: u64,
+    /// Scans that were not deskewed, for odometry has the robot move faster than 10 m/s or 10 rad/s
+    /// during their sweeps: it was reset meanwhile, or a pose found anew.
+    pub scans_not_deskewed: u64,
     /// Scans that went without odometry; only engines that can do without have such.
     pub scans_without_odometry: u64,
     /// Processed scans that left a direction open, where the engine looks for it.
@@ -220,7 +223,8 @@ impl StatusSource {
         gauges: &Gauges,
     ) -> (State, String) {
         let uptime_s = self.uptime_s();
-        judgement::judge(&Circumstances { uptime_s, inputs, snapshot, gauges })
+        let engine = self.engine;
+        judgement::judge(&Circumstances { engine, uptime_s, inputs, snapshot, gauges })
     }
 
     fn uptime_s(&self) -> f64 {
@@ -344,6 +348,7 @@ fn filter_status(snapshot: &Snapshot, gauges: &Gauges) -> FilterStatus {
         resamples: snapshot.resamples,
         odometry_jumps: gauges.odometry_jumps,
         odometry_restarts: gauges.odometry_restarts,
+        scans_not_deskewed: gauges.scans.not_deskewed,
         scans_without_odometry: gauges.without_odometry,
         weak_directions: gauges.weak,
         weak_direction: report.and_then(|report| report.weak_direction),

@@ -159,6 +159,9 @@ pub struct ScanCounts {
     pub reordered: u64,
     /// Times the clock was set back.
     pub clock_restarts: u64,
+    /// Taken as if the robot had stood still, for odometry has it move faster than a robot does
+    /// during the sweep.
+    pub not_deskewed: u64,
 }
 
 /// A scan that waits.
@@ -483,7 +486,7 @@ impl Synchronizer {
             match self.place(&first, frames) {
                 Ok(Place { mount, odom_from_base, velocity }) => {
                     let mut scan = first.framed.scan;
-                    scan.geometry = self.timed(&scan).with_velocity(velocity);
+                    scan.geometry = self.timed(&scan).with_velocity(self.believed(velocity));
                     self.feed(scan.stamp);
                     self.taken = Some(scan.stamp);
                     self.calls.push_back(Call::Scan(ReadyScan { scan, mount, odom_from_base }));
@@ -497,6 +500,16 @@ impl Synchronizer {
                 }
             }
         }
+    }
+
+    /// The motion during a sweep, or none where no robot moves like that: its odometry was reset
+    /// meanwhile, or its pose found anew.
+    fn believed(&mut self, velocity: Velocity) -> Velocity {
+        if velocity.is_of_a_robot() {
+            return velocity;
+        }
+        self.counts.not_deskewed += 1;
+        Velocity::default()
     }
 
     /// Gives the filter the odometry up to a stamp.
@@ -514,6 +527,7 @@ impl Synchronizer {
     /// How the laser sat and where odometry had the base when a scan was taken.
     fn place(&self, waiting: &Waiting, frames: &Frames) -> Result<Place, Lack> {
         let (framed, stamp) = (&waiting.framed, waiting.stamp());
+        let sweep_s = self.sweep_time(&framed.scan)?;
         let mount = frames.mount(&framed.frame, stamp).map_err(|error| {
             let (verdict, chance) = match error {
                 MountError::Tilted { .. } => (Verdict::TiltedMount, Chance::Gone),
@@ -526,7 +540,7 @@ impl Synchronizer {
         if self.settings.source == OdometrySource::None || none_comes {
             return Ok(Place::still(mount));
         }
-        match self.odometry_during(&framed.scan) {
+        match self.odometry_during(stamp, sweep_s) {
             Ok((pose, velocity)) => Ok(Place { mount, odom_from_base: Some(pose), velocity }),
             Err(lack) if self.can_go_without(&lack) => {
                 let now = waiting.goes_without || lack.chance == Chance::Gone;
@@ -536,19 +550,22 @@ impl Synchronizer {
         }
     }
 
-    /// Where the base was at the stamp of a scan, and how fast during its sweep.
-    fn odometry_during(&self, scan: &Scan) -> Result<(Pose2, Velocity), Lack> {
-        let odom_from_base = self.odometry_at(scan.stamp)?;
-        Ok((odom_from_base, self.velocity(scan, odom_from_base)?))
+    /// Where the base was at the stamp of a scan, and how fast during its sweep, for which odometry
+    /// at the end of it is needed.
+    fn odometry_during(&self, stamp: Stamp, sweep_s: f64) -> Result<(Pose2, Velocity), Lack> {
+        let odom_from_base = self.odometry_at(stamp)?;
+        if sweep_s == 0.0 {
+            return Ok((odom_from_base, Velocity::default()));
+        }
+        let end = Stamp(stamp.0.saturating_add((sweep_s * 1e9) as i64));
+        let motion = odom_from_base.between(self.odometry_at(end)?);
+        Ok((odom_from_base, Velocity::of_motion(motion, sweep_s)))
     }
 
-    /// How the base moved during a sweep, for which odometry at the end of it is needed.
-    fn velocity(&self, scan: &Scan, odom_from_base: Pose2) -> Result<Velocity, Lack> {
+    /// Seconds from the first beam of a scan to the last, if a laser can take so long.
+    fn sweep_time(&self, scan: &Scan) -> Result<f64, Lack> {
         let beams = scan.ranges.len().saturating_sub(1) as f64;
         let seconds = self.timed(scan).time_increment() * beams;
-        if seconds == 0.0 {
-            return Ok(Velocity::default());
-        }
         if seconds.is_nan() || seconds.abs() > LONGEST_SWEEP_S {
             let detail = format!(
                 "by its time_increment the sweep takes {seconds} s, which no laser needs; set \
@@ -556,9 +573,7 @@ impl Synchronizer {
             );
             return Err(Lack { verdict: Verdict::BadGeometry, detail, chance: Chance::Gone });
         }
-        let end = Stamp(scan.stamp.0.saturating_add((seconds * 1e9) as i64));
-        let motion = odom_from_base.between(self.odometry_at(end)?);
-        Ok(Velocity::of_motion(motion, seconds))
+        Ok(seconds)
     }
 
     /// When the beams of a scan are taken: as configured, or as it says.

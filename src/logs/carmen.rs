@@ -94,6 +94,20 @@ impl CarmenLog {
         readings.lasers.flaser_pose = FlaserPose::OfLaser;
         Ok(readings.filter(|reading| reading.as_ref().map_or(true, |r| r.scan.is_some())))
     }
+
+    /// Whether the pose of some scan was corrected: in a raw log all are those of odometry.
+    ///
+    /// # Errors
+    /// When the file cannot be read again.
+    pub fn has_corrected_poses(&self) -> Result<bool, LogError> {
+        let scans = self.readings()?.filter(|r| r.as_ref().map_or(true, |r| r.scan.is_some()));
+        for (raw, corrected) in scans.zip(self.corrected_readings()?) {
+            if !is_close(raw?.odom_from_base, corrected?.odom_from_base) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
 }
 
 /// The usable readings of a log, one after the other.

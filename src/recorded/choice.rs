@@ -126,9 +126,16 @@ impl Topics {
                 _ => return Err(several("odometry", &messages, "--odom")),
             };
         }
-        let wanted = source != OdometrySource::None;
-        if wanted && odometry.is_none() && (transforms.is_empty() || source == OdometrySource::Odom)
-        {
+        let none = match source {
+            OdometrySource::None => false,
+            OdometrySource::Odom => odometry.is_none(),
+            OdometrySource::Tf => transforms.is_empty(),
+            OdometrySource::Auto => {
+                let needed = config.raw.engine.needs_odometry();
+                needed && odometry.is_none() && transforms.is_empty()
+            }
+        };
+        if none {
             return Err(Unclear::NoOdometry(every()));
         }
         transforms.extend(near(Kind::StaticTransforms));

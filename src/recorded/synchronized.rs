@@ -112,13 +112,14 @@ impl Synchronized {
                 self.odometry = Some((stamp, odom_from_base));
             }
             Call::Scan(ReadyScan { scan, mount, odom_from_base }) => {
-                let stamp = scan.stamp;
-                // None only if the configuration wants none, and then nobody looks at it.
-                let odom_from_base = odom_from_base.unwrap_or_default();
+                let (line, stamp) = (self.line, scan.stamp);
+                let Some(odom_from_base) = odom_from_base else {
+                    self.give_odometry();
+                    return self.ready.push_back(Event::ScanAlone(scan, mount));
+                };
                 // The odometry of a scan comes with it, and once is enough.
                 self.odometry.take_if(|odometry| *odometry == (stamp, odom_from_base));
                 self.give_odometry();
-                let line = self.line;
                 let reading = Reading { line, stamp, odom_from_base, scan: Some(scan), mount };
                 self.ready.push_back(Event::Reading(reading));
             }
@@ -145,13 +146,14 @@ pub(super) fn settings(
     tf_path: String,
 ) -> synchronizer::Settings {
     let raw = &config.raw;
+    let need = if raw.engine.needs_odometry() { Need::Required } else { Need::Optional };
     synchronizer::Settings {
         odometry_timeout: Duration::from_secs_f64(raw.odometry_timeout_s),
         most_waiting: raw.scan_queue,
         sweep_time_s: raw.sweep_time_s,
         source,
         sought: Sought::Odometry,
-        need: Need::Required,
+        need,
         odom_key,
         tf_path,
     }

@@ -9,6 +9,8 @@ use super::pose::Pose2;
 
 /// Turns slower than this, rad, are straight: the difference is below a nanometre a metre.
 const STRAIGHT: f64 = 1e-9;
+/// No robot that maps is faster: m/s and rad/s.
+const FASTEST: [f64; 2] = [10.0, 10.0];
 
 /// How the base moves, in its own frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -34,6 +36,12 @@ impl Velocity {
             y: (straight * y - half * x) / seconds,
             turn: theta / seconds,
         }
+    }
+
+    /// Whether a robot moves like that. What has the pose jump during a sweep does not.
+    #[must_use]
+    pub fn is_of_a_robot(self) -> bool {
+        libm::hypot(self.x, self.y) <= FASTEST[0] && self.turn.abs() <= FASTEST[1]
     }
 
     /// Where the base is after `seconds`, seen from where it was.

@@ -143,15 +143,6 @@ impl Engine {
         }
     }
 
-    /// Whether scans without odometry are of no use to it.
-    #[must_use]
-    pub const fn needs_odometry(&self) -> bool {
-        match self {
-            Self::GMapping(_) | Self::KnownPoses(_) => true,
-            Self::Hector(_) => false,
-        }
-    }
-
     /// Forgets map and path, as if nothing had been read: the next scan is the first, at
     /// `initial_pose` in `map`, or where odometry says.
     pub fn reset(&mut self, initial_pose: Option<Pose2>) {

@@ -93,7 +93,10 @@ impl ScanGeometry {
     #[must_use]
     pub fn is_usable(&self) -> bool {
         let Self { angle_min, angle_increment, range_min, range_max, .. } = *self;
-        Self::new([angle_min, angle_min], angle_increment, [range_min, range_max]).is_ok()
+        let Velocity { x, y, turn } = self.velocity;
+        let motion = [self.time_increment, x, y, turn];
+        let new = Self::new([angle_min, angle_min], angle_increment, [range_min, range_max]);
+        new.is_ok() && motion.into_iter().all(f64::is_finite)
     }
 
     /// The same with `seconds` from beam to beam; 0 takes all at once.

@@ -542,6 +542,7 @@ async fn the_newest_verdict_arrives_however_many_there_are() {
             stamp: Some(Stamp(7)),
             verdict: Verdict::NotMovedEnough,
             detail: String::new(),
+            weak_direction: None,
         };
         rig.verdicts.send(entry).unwrap();
     }

@@ -201,7 +201,7 @@ fn scans_are_taken_in_the_order_of_their_stamps_or_not_at_all() {
     rig.scan(60);
     let expected = ["Duplicate30", "o0", "s30", "s50", "Late40", "Duplicate50", "s60"];
     assert_eq!(rig.told(), expected);
-    let counts = ScanCounts { duplicates: 2, reordered: 2, clock_restarts: 0 };
+    let counts = ScanCounts { duplicates: 2, reordered: 2, ..ScanCounts::default() };
     assert_eq!(rig.synchronizer.scan_counts(), counts);
 }
 
@@ -445,40 +445,60 @@ fn without_a_source_no_odometry_is_taken_and_no_scan_waits() {
     assert_eq!(rig.told(), ["s-"]);
 }
 
-/// Odometry moves by a metre a millisecond.
+/// The scan that is ready, taken at 30 ms by a laser that sweeps for 20 ms, if the robot moves by
+/// `speed` m/s.
+fn swept(rig: &mut Rig, speed: f64) -> ReadyScan {
+    let odometry = |rig: &mut Rig, milliseconds: i64| {
+        let pose = Pose2::new(speed * milliseconds as f64 * 1e-3, 0.0, 0.0);
+        rig.synchronizer.odometry(Channel::Messages, (stamp(milliseconds), pose), &rig.frames);
+    };
+    odometry(rig, 0);
+    odometry(rig, 40);
+    rig.scan(30);
+    assert_eq!((rig.told().len(), rig.synchronizer.waiting()), (0, 1));
+    odometry(rig, 60);
+    let mut calls = rig.calls();
+    let Some(Call::Scan(ready)) = calls.pop() else { panic!("{calls:?}") };
+    assert!((ready.odom_from_base.unwrap().x - 0.03 * speed).abs() < 1e-9);
+    ready
+}
+
 #[test]
 fn a_sweep_waits_for_the_odometry_of_its_end_and_has_the_speed_between() {
     let mut rig = Rig::new(Settings { sweep_time_s: Some(0.02), ..settings() });
-    rig.odometry(0);
-    rig.odometry(40);
-    rig.scan(30);
-    assert_eq!((rig.told().len(), rig.synchronizer.waiting()), (0, 1));
-    rig.odometry(60);
-    let calls = rig.calls();
-    let Some(Call::Scan(ready)) = calls.last() else { panic!("{calls:?}") };
-    assert_eq!(ready.odom_from_base.unwrap().x, 30.0);
-    let last = ready.scan.geometry.motion_until(2).expect("the base moves");
-    assert!((last.x - 20.0).abs() < 1e-9 && last.y == 0.0 && last.theta == 0.0, "{last:?}");
+    let last = swept(&mut rig, 5.0).scan.geometry.motion_until(2).expect("the base moves");
+    assert!((last.x - 0.1).abs() < 1e-9 && last.y == 0.0 && last.theta == 0.0, "{last:?}");
+    assert_eq!(rig.synchronizer.scan_counts().not_deskewed, 0);
+}
+
+/// Odometry was reset during the sweep, or another robot's came between.
+#[test]
+fn a_sweep_is_not_smeared_by_a_motion_that_no_robot_makes() {
+    let mut rig = Rig::new(Settings { sweep_time_s: Some(0.02), ..settings() });
+    assert_eq!(swept(&mut rig, 11.0).scan.geometry.motion_until(2), None);
+    assert_eq!(rig.synchronizer.scan_counts().not_deskewed, 1);
 }
 
 #[test]
 fn what_no_laser_takes_for_a_sweep_is_told() {
-    let mut rig = rig();
-    rig.odometry(0);
-    rig.odometry(40);
-    let geometry = ScanGeometry::new([0.0, 1.0], 0.5, [0.1, 9.0]).unwrap();
-    for (number, seconds) in (1..).zip([f64::NAN, 20.0]) {
-        let geometry = geometry.with_time_increment(seconds);
-        let scan = Scan { stamp: stamp(number), geometry, ranges: vec![1.0; 3] };
-        let framed = FramedScan { scan, frame: "base_link".to_owned() };
-        rig.synchronizer.scan(framed, rig.start, &rig.frames);
+    let without = Settings { source: OdometrySource::None, need: Need::Optional, ..settings() };
+    for mut rig in [rig(), Rig::new(without)] {
+        rig.odometry(0);
+        rig.odometry(40);
+        let geometry = ScanGeometry::new([0.0, 1.0], 0.5, [0.1, 9.0]).unwrap();
+        for (number, seconds) in (1..).zip([f64::NAN, 20.0, -1e30]) {
+            let geometry = geometry.with_time_increment(seconds);
+            let scan = Scan { stamp: stamp(number), geometry, ranges: vec![1.0; 3] };
+            let framed = FramedScan { scan, frame: "base_link".to_owned() };
+            rig.synchronizer.scan(framed, rig.start, &rig.frames);
+        }
+        let details = rig.details();
+        assert_eq!(details.len(), 3);
+        assert!(
+            details[1].contains("takes 40 s") && details[1].contains("sweep_time_s"),
+            "{details:?}"
+        );
     }
-    let details = rig.details();
-    assert_eq!(details.len(), 2);
-    assert!(
-        details[1].contains("takes 40 s") && details[1].contains("sweep_time_s"),
-        "{details:?}"
-    );
 }
 
 /// Another synchronizer that goes on from what this one leaves, as after a restart.
