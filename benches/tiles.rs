@@ -18,7 +18,7 @@ use gmapd::config::Config;
 use gmapd::convert;
 use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::snapshot::MapVersion;
-use gmapd::daemon::tiles::{TileSet, run_number};
+use gmapd::daemon::tiles::{TileSet, digest, run_number};
 use gmapd::map::tiles::compress;
 use gmapd::ros;
 use gmapd::sim::lidar::Lidar;
@@ -115,7 +115,7 @@ fn measure_hour(versions: &[Arc<MapVersion>]) -> Value {
         set.update(Some(version));
         let changes = set.since(version.version - 1);
         milliseconds.push(watch.elapsed().cpu.as_secs_f64() * 1e3);
-        tiles += size(&changes) + DIGESTS_PER_VERSION * size(&set.digest());
+        tiles += size(&changes) + DIGESTS_PER_VERSION * size(&digest(*set.head()));
         catch_up.push(size(&set.since(version.version.saturating_sub(AWAY as u64))) as f64);
         let grid = version.occupancy.to_grid(version.occupied_threshold).expect("it is known");
         let message = convert::occupancy_grid(ros::Header::default(), &grid);

@@ -6,6 +6,7 @@ use std::time::Duration;
 use gmapd::client::{MapMirror, MirrorState};
 use gmapd::clock::Stopwatch;
 use gmapd::daemon::keys::Prefix;
+use gmapd::daemon::serving::Settings;
 use gmapd::daemon::tiles::publishing::DIGEST_PERIOD;
 use gmapd::map::content_hash;
 use gmapd::map::tiles::{LARGEST_MESSAGE, Message};
@@ -98,6 +99,31 @@ async fn a_reset_empties_the_mirror_and_a_new_map_fills_it() {
     let state = until(&mirror, has(&anew)).await;
     assert_eq!(state.map.grid(), grid(&drive[0]));
     assert_same_map(&rig, &state).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_comes_late_makes_nobody_else_ask() {
+    let drive = drive();
+    let daemon = open("peer", None).await;
+    let client = open("peer", Some(&locator(&daemon).await)).await;
+    let long = |settings: &mut Settings| settings.map_update_interval = PATIENCE * 10;
+    let rig = Rig::with(daemon, client, drive[0].clone(), long).await;
+    let mirror = follow(&rig.client).await;
+    until(&mirror, has(&drive[0])).await;
+    let mut news = mirror.states();
+    // With the digest, the first version has been published, and no other is for long.
+    news.changed().await.expect("the mirror lives");
+    drive[1..5].iter().for_each(|snapshot| rig.show(snapshot));
+    let late = follow(&rig.client).await;
+    until(&late, has(&drive[4])).await;
+    for _ in 0..2 {
+        news.mark_unchanged();
+        news.changed().await.expect("the mirror lives");
+    }
+    let state = mirror.state();
+    assert_eq!((state.repairs, state.newest_version), (1, Some(version(&drive[0]).version)));
+    assert_eq!(late.map().version(), version(&drive[4]).version);
+    assert_eq!(late.state().repairs, 1);
 }
 
 /// Two sessions with a way between them that loses some of what is published.
