@@ -128,6 +128,60 @@ async fn who_comes_late_makes_nobody_else_ask() {
     assert_eq!(late.state().repairs, 1);
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_question_that_is_refused_is_told() {
+    let daemon = open("peer", None).await;
+    let client = open("client", Some(&locator(&daemon).await)).await;
+    let refuse = |query: zenoh::query::Query| {
+        zenoh::Wait::wait(query.reply_err("not now")).ok();
+    };
+    let tiles = format!("{ROBOT}/slam/tiles");
+    daemon.declare_queryable(tiles).callback(refuse).background().await.expect("it is a key");
+    let alive = format!("{ROBOT}/slam/alive");
+    let _alive = daemon.liveliness().declare_token(alive).await.expect("it is a key");
+    let mirror = follow(&client).await;
+    let state = until(&mirror, |state| state.last_error.is_some()).await;
+    assert_eq!((state.last_error.as_deref(), state.is_newest), (Some("not now"), false));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_daemon_that_comes_is_seen_though_messages_are_too_many() {
+    let daemon = open("peer", None).await;
+    let client = open("client", Some(&locator(&daemon).await)).await;
+    let mirror = follow(&client).await;
+    let (sender, mut heard) = unbounded_channel();
+    let tell = move |sample: Sample| drop(sender.send(sample));
+    let key = format!("{ROBOT}/slam/tiles");
+    client.declare_subscriber(&key).callback(tell).background().await.expect("it is a key");
+    let publisher = daemon.declare_publisher(&key);
+    let publisher = publisher.congestion_control(zenoh::qos::CongestionControl::Block);
+    let publisher = publisher.await.expect("it is a key");
+    while !publisher.matching_status().await.expect("it is declared").matching() {
+        tokio::task::yield_now().await;
+    }
+    // The only thread that follows does something else.
+    let (hold, held) = std::sync::mpsc::channel::<()>();
+    let (begin, begun) = tokio::sync::oneshot::channel();
+    tokio::spawn(async move {
+        begin.send(()).ok();
+        held.recv().ok();
+    });
+    begun.await.expect("it begins");
+    for _ in 0..1000 {
+        publisher.put("no tiles").await.expect("the session is open");
+    }
+    for _ in 0..1000 {
+        next(&mut heard).await;
+    }
+    let alive = format!("{ROBOT}/slam/alive");
+    let mut lives = liveliness(&client).await;
+    let _alive = daemon.liveliness().declare_token(alive).await.expect("it is a key");
+    assert_eq!(next(&mut lives).await.kind(), SampleKind::Put);
+    drop(hold);
+    let state = until(&mirror, |state| state.is_alive).await;
+    assert!(state.repairs > 0);
+}
+
 /// Two sessions with a way between them that loses some of what is published.
 struct LossyRelay {
     daemons_side: zenoh::Session,
