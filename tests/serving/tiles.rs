@@ -22,6 +22,10 @@ use super::*;
 /// Beyond what is promised, for a machine that does other things as well.
 const SLACK: Duration = Duration::from_secs(1);
 
+/// Held by the tests that measure time: a client that does not read holds a thread that all of
+/// Zenoh's sessions in this process share.
+static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+
 async fn follow(session: &zenoh::Session) -> MapMirror {
     let robot = Prefix::parse(ROBOT).expect("it is a key");
     MapMirror::follow(session, &robot).await.expect("nothing stands against it")
@@ -238,6 +242,7 @@ impl LossyRelay {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn after_thirty_percent_were_lost_mirrors_are_right_within_a_digest_period() {
+    let _alone = ALONE.lock().await;
     let drive = drive();
     let rig = Rig::start(drive[0].clone()).await;
     let relay = LossyRelay::start(&rig.daemon).await;
@@ -284,6 +289,7 @@ fn numbered((number, snapshot): (usize, &Snapshot)) -> Snapshot {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn behind_a_router_that_was_killed_mirrors_are_right_within_a_digest_period() {
+    let _alone = ALONE.lock().await;
     let drive = drive();
     let mut router = Some(Router::start("tcp/127.0.0.1:0"));
     let endpoint = router.as_ref().expect("it is there").endpoint.clone();
@@ -356,6 +362,7 @@ async fn latency(
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_client_that_does_not_read_slows_no_other() {
+    let _alone = ALONE.lock().await;
     let drive = drive();
     let rig = Rig::start(drive[0].clone()).await;
     let mirror = follow(&rig.client).await;
