@@ -1,12 +1,17 @@
 //! What following a map by tiles costs beside sending it whole: bytes over a simulated hour of
-//! driving, and processor and memory of many mirrors and of many robots behind a real router.
+//! driving, and processor and memory of many mirrors and of many robots behind a router.
+//!
+//! Robots serve as the daemon does, all of them in this process; the router and the base station
+//! that mirrors them are processes of their own.
 //!
 //! `cargo bench --bench tiles`; the figures are printed as JSON. With `hour` or `fleet` behind `--`
 //! only one of the two.
 
-use std::io::{Read as _, Write as _};
-use std::process::{Command, Stdio};
-use std::sync::{Arc, Mutex};
+use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader, Read, Write as _};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -14,23 +19,29 @@ use flate2::Compression;
 use flate2::write::DeflateEncoder;
 use gmapd::client::MapMirror;
 use gmapd::clock::{Stopwatch, peak_resident_memory};
-use gmapd::config::Config;
+use gmapd::config::{Config, EngineKind};
 use gmapd::convert;
+use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
-use gmapd::daemon::snapshot::MapVersion;
-use gmapd::daemon::tiles::{TileSet, run_number};
+use gmapd::daemon::ledger::{Entry, Ledger};
+use gmapd::daemon::links::LinksStatus;
+use gmapd::daemon::ros_node::{Convention, RosNode};
+use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
+use gmapd::daemon::snapshot::{Estimate, MapVersion, Snapshot, State};
+use gmapd::daemon::status::{FilterStatus, Status};
+use gmapd::daemon::tiles::{TileSet, digest};
 use gmapd::map::tiles::compress;
 use gmapd::ros;
 use gmapd::sim::lidar::Lidar;
 use gmapd::sim::{Simulation, building};
 use gmapd::slam::gmapping::{GMapping, ScanReading, ScanUpdate};
 use gmapd::slam::grid::occupancy::OccupancyGrid;
-use gmapd::slam::pose::Stamp;
+use gmapd::slam::known_map::Mode;
+use gmapd::slam::pose::{Pose2, Stamp};
 use gmapd::statistics::Spread;
 use serde_json::{Value, json};
+use tokio::sync::{broadcast, mpsc, watch};
 use zenoh::Session;
-use zenoh::liveliness::LivelinessToken;
-use zenoh::qos::{CongestionControl, Priority};
 
 const SEED: u64 = 1;
 /// Side of the building, m: half of the hour goes by before the robot has been everywhere.
@@ -54,6 +65,9 @@ fn main() {
         let number = |word: &str| word.parse().expect("it is a number");
         let figures = runtime.block_on(base(endpoint, number(robots), number(mirrors)));
         return println!("{figures}");
+    }
+    if words == ["router"] {
+        return println!("{}", runtime.block_on(router()));
     }
     let config = Config::load(None, &[format!("seed={SEED}")]).expect("it is one");
     let chosen = |part| words.is_empty() || words.contains(&part);
@@ -115,7 +129,7 @@ fn measure_hour(versions: &[Arc<MapVersion>]) -> Value {
         set.update(Some(version));
         let changes = set.since(version.version - 1);
         milliseconds.push(watch.elapsed().cpu.as_secs_f64() * 1e3);
-        tiles += size(&changes) + DIGESTS_PER_VERSION * size(&set.digest());
+        tiles += size(&changes) + DIGESTS_PER_VERSION * size(&digest(*set.head()));
         catch_up.push(size(&set.since(version.version.saturating_sub(AWAY as u64))) as f64);
         let grid = version.occupancy.to_grid(version.occupied_threshold).expect("it is known");
         let message = convert::occupancy_grid(ros::Header::default(), &grid);
@@ -196,84 +210,166 @@ fn robot_name(number: usize) -> String {
     format!("fleet/robot{number:02}")
 }
 
-/// A robot as the mesh sees it, without its filter.
+/// A robot as the mesh sees it: the daemon without its filter.
 struct Robot {
-    session: Session,
-    tiles: Arc<Mutex<TileSet>>,
-    _alive: LivelinessToken,
+    snapshots: watch::Sender<Arc<Snapshot>>,
+    serving: Serving,
+    /// What the filter's side holds.
+    _filter: (broadcast::Sender<Entry>, mpsc::Receiver<Request>),
+    _session: Session,
 }
 
 impl Robot {
-    async fn start(endpoint: &str, number: usize) -> Self {
+    async fn start(endpoint: &str, number: usize, first: &Arc<MapVersion>) -> Self {
         let session = session("client", Some(endpoint)).await;
-        let run = run_number(&session.zid().to_string(), number as i64);
-        let tiles = Arc::new(Mutex::new(TileSet::new(run, 0.05)));
-        let (key, asked) = (format!("{}/slam/tiles", robot_name(number)), tiles.clone());
-        let answer = move |query: zenoh::query::Query| {
-            let since = query.parameters().get("since").and_then(|text| text.parse().ok());
-            let messages = asked.lock().expect("nobody panics").since(since.unwrap_or(0));
-            for message in messages {
-                zenoh::Wait::wait(query.reply(query.key_expr(), message)).ok();
-            }
-        };
-        let queryable = session.declare_queryable(key).callback(answer).background();
-        queryable.await.expect("it is a key");
-        let token = format!("{}/slam/alive", robot_name(number));
-        let alive = session.liveliness().declare_token(token).await.expect("it is a key");
-        Self { session, tiles, _alive: alive }
+        let config = Config::load(None, &["map_update_interval=0.1".to_owned()]);
+        let settings = Settings::new(&config.expect("it is one"), PathBuf::from("maps"));
+        let (snapshots, watched) = watch::channel(Arc::new(snapshot(first)));
+        let (verdicts, heard) = broadcast::channel(16);
+        let (commander, commands) = mpsc::channel(16);
+        let status = AskStatus::new(status);
+        let sources = Sources { snapshots: watched, verdicts: heard, commands: commander, status };
+        let prefix = Prefix::parse(&robot_name(number)).expect("it is a key");
+        let node = RosNode::new(session.zid().to_string(), prefix, Convention::Bridge);
+        let serving = Serving::start(&session, node, settings, sources).await;
+        let serving = serving.expect("nothing stands against it");
+        Self { snapshots, serving, _filter: (verdicts, commands), _session: session }
     }
 
-    async fn tell(&self, number: usize, version: &Arc<MapVersion>) -> usize {
-        let key = format!("{}/slam/tiles", robot_name(number));
-        let messages = {
-            let mut tiles = self.tiles.lock().expect("nobody panics");
-            let before = tiles.head().version;
-            tiles.update(Some(version));
-            tiles.since(before)
-        };
-        for message in &messages {
-            let put = self.session.put(&key, message.clone());
-            let put = put.congestion_control(CongestionControl::Drop);
-            put.priority(Priority::Background).await.expect("the session is open");
-        }
-        size(&messages)
+    fn show(&self, version: &Arc<MapVersion>) {
+        self.snapshots.send_replace(Arc::new(snapshot(version)));
     }
 }
 
-/// Robots behind a router, and one base station, a process of its own, that mirrors their maps: a
-/// version a second.
+fn snapshot(version: &Arc<MapVersion>) -> Snapshot {
+    Snapshot {
+        estimate: Estimate {
+            stamp: Some(version.stamp),
+            pose_in_map: Pose2::IDENTITY,
+            covariance: nalgebra::Matrix3::zeros(),
+            map_from_odom: Pose2::IDENTITY,
+            has_odometry: true,
+            particles: Arc::new([]),
+            report: None,
+        },
+        ledger: Ledger::default(),
+        milliseconds_per_scan: None,
+        resamples: 0,
+        paused: false,
+        mode: Mode::Mapping,
+        map: Some(version.clone()),
+    }
+}
+
+fn status() -> Status {
+    Status {
+        version: "1.0.0",
+        engine: EngineKind::Gmapping,
+        links: LinksStatus::default(),
+        mode: Mode::Mapping,
+        uptime_s: 1.0,
+        state: State::Mapping,
+        detail: String::new(),
+        pose_in_map: Pose2::IDENTITY,
+        laser: None,
+        scans: BTreeMap::new(),
+        last_details: BTreeMap::new(),
+        inputs: BTreeMap::new(),
+        milliseconds_per_scan: None,
+        real_time_factor: None,
+        scans_waiting: 0,
+        filter: FilterStatus::default(),
+        map: None,
+        checkpoint: None,
+        peak_memory_bytes: None,
+        seed: SEED,
+    }
+}
+
+/// Bytes of memory that this process has now.
+fn resident() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kilobytes = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
+    kilobytes.unwrap_or(0) << 10
+}
+
+/// What a process took since the watch was started.
+fn cost(watch: &Stopwatch) -> Value {
+    let spent = watch.elapsed();
+    json!({
+        "share of a processor": spent.cpu.as_secs_f64() / spent.wall.as_secs_f64(),
+        "megabytes": resident() >> 20,
+    })
+}
+
+/// Another process of this program.
+fn child(words: &[&str]) -> Child {
+    let own = std::env::current_exe().expect("this program has a path");
+    let mut command = Command::new(own);
+    command.args(words).stdin(Stdio::piped()).stdout(Stdio::piped());
+    command.spawn().expect("it runs")
+}
+
+/// The router: tells where it listens, and what it took when nobody writes to it any more.
+async fn router() -> Value {
+    let session = session("router", None).await;
+    println!("{}", session.info().locators().await.first().expect("it listens"));
+    let watch = Stopwatch::start();
+    let end = || std::io::stdin().read_to_end(&mut Vec::new());
+    tokio::task::spawn_blocking(end).await.expect("it does not panic").ok();
+    let cost = cost(&watch);
+    session.close().await.ok();
+    cost
+}
+
+/// The figures that a child prints at its end.
+fn figures(mut output: impl Read) -> Value {
+    let mut text = String::new();
+    output.read_to_string(&mut text).expect("it is text");
+    serde_json::from_str(&text).expect("it prints figures")
+}
+
+/// Robots behind a router, and a base station that mirrors their maps: a version a second.
 async fn fleet(versions: Arc<Vec<Arc<MapVersion>>>, robots: usize, mirrors: usize) -> Value {
-    let router = session("router", None).await;
-    let endpoint = router.info().locators().await.first().expect("it listens").to_string();
+    let mut router = child(&["router"]);
+    let mut router_output = BufReader::new(router.stdout.take().expect("it is piped"));
+    let mut endpoint = String::new();
+    router_output.read_line(&mut endpoint).expect("it tells where it listens");
+    let endpoint = endpoint.trim();
+    let (first, newer) = versions[versions.len() / 2..].split_first().expect("there are some");
     let mut fleet = Vec::new();
     for number in 0..robots {
-        let robot = Robot::start(&endpoint, number).await;
-        robot.tell(number, &versions[versions.len() / 2]).await;
-        fleet.push(robot);
+        fleet.push(Robot::start(endpoint, number, first).await);
     }
-    let own = std::env::current_exe().expect("this program has a path");
-    let words = ["base".to_owned(), endpoint, robots.to_string(), mirrors.to_string()];
-    let mut base = Command::new(own).args(words).stdout(Stdio::piped()).spawn().expect("it runs");
-    let mut output = base.stdout.take().expect("it is piped");
-    let mut sent = 0;
+    let mut base = child(&["base", endpoint, &robots.to_string(), &mirrors.to_string()]);
+    let base_output = base.stdout.take().expect("it is piped");
+    let base_figures = tokio::task::spawn_blocking(move || figures(base_output));
+    let mut set = TileSet::new(1, 0.05);
+    set.update(Some(first));
+    let (watch, mut sent) = (Stopwatch::start(), 0);
     let mut ticks = tokio::time::interval(Duration::from_secs(1));
-    let reader = tokio::task::spawn_blocking(move || {
-        let mut text = String::new();
-        output.read_to_string(&mut text).map(|_| text)
-    });
-    let mut newest = versions[versions.len() / 2 + 1..].iter().cycle();
-    for _ in 0..FLEET_S {
+    for version in newer.iter().take(FLEET_S) {
         ticks.tick().await;
-        let version = newest.next().expect("it goes round");
-        for (number, robot) in fleet.iter().enumerate() {
-            sent += robot.tell(number, version).await;
-        }
+        let before = set.head().version;
+        set.update(Some(version));
+        sent += robots * size(&set.since(before));
+        fleet.iter().for_each(|robot| robot.show(version));
     }
-    drop(fleet);
-    let text = reader.await.expect("it does not panic").expect("it is text");
-    base.wait().ok();
-    let figures: Value = serde_json::from_str(&text).expect("the base prints figures");
-    json!({"base": figures, "bytes a second of all robots": sent / FLEET_S})
+    let robots_cost = cost(&watch);
+    for robot in fleet {
+        robot.serving.stop().await;
+    }
+    let base_figures = base_figures.await.expect("it does not panic");
+    drop(router.stdin.take());
+    let router_figures = figures(router_output);
+    base.wait().and_then(|_| router.wait()).ok();
+    json!({
+        "base": base_figures,
+        "router": router_figures,
+        "robots, all in one process": robots_cost,
+        "bytes a second of all robots' tiles": sent / FLEET_S,
+    })
 }
 
 /// The base station: so many mirrors of each robot, for as long as robots are there.

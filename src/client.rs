@@ -56,6 +56,8 @@ pub struct MirrorState {
     pub repairs: u64,
     /// Messages that could not be read.
     pub rejected: u64,
+    /// What the daemon said when it refused the last question; `None` since one was answered.
+    pub last_error: Option<String>,
 }
 
 /// Follows the map of one robot: holds the last version that came as a whole, never a mixture of
@@ -68,12 +70,12 @@ pub struct MapMirror {
     _subscribers: [Subscriber<()>; 2],
 }
 
-/// What comes from the daemon.
-#[derive(Debug)]
-enum News {
-    Message(Bytes),
-    Comes,
-    Goes,
+/// The daemon's comings and goings, which are never lost as messages may be.
+#[derive(Debug, Clone, Copy, Default)]
+struct Life {
+    is_alive: bool,
+    /// How often it came.
+    comings: u64,
 }
 
 impl MapMirror {
@@ -87,16 +89,18 @@ impl MapMirror {
             let key = key.to_string();
             move |error| MirrorError::Subscribe { key, reason: plain_message(&error) }
         };
-        let (sender, news) = mpsc::channel(WAITING);
-        let messages = sender.clone();
+        let (sender, messages) = mpsc::channel(WAITING);
+        let (life_sender, lives) = watch::channel(Life::default());
         // Zenoh's thread is never held up: what does not fit is lost, and asked for later.
         let on_message = move |sample: Sample| {
             let bytes = Bytes::from(sample.payload().to_bytes().into_owned());
-            messages.try_send(News::Message(bytes)).ok();
+            sender.try_send(bytes).ok();
         };
         let on_life = move |sample: Sample| {
-            let comes = sample.kind() == SampleKind::Put;
-            sender.try_send(if comes { News::Comes } else { News::Goes }).ok();
+            let is_alive = sample.kind() == SampleKind::Put;
+            life_sender.send_modify(|life| {
+                *life = Life { is_alive, comings: life.comings + u64::from(is_alive) };
+            });
         };
         let subscriber = session.declare_subscriber(&tiles).callback(on_message).await;
         let subscriber = subscriber.map_err(failed(&tiles))?;
@@ -107,7 +111,9 @@ impl MapMirror {
             asker: Asker { session: session.clone(), key: tiles.to_string() },
             mirror: Mirror::new(),
             states: sender,
-            news,
+            messages,
+            lives,
+            comings: 0,
             repair: None,
         };
         let follower = tokio::spawn(follower.run());
@@ -150,24 +156,34 @@ struct Follower {
     asker: Asker,
     mirror: Mirror,
     states: watch::Sender<MirrorState>,
-    news: mpsc::Receiver<News>,
+    messages: mpsc::Receiver<Bytes>,
+    lives: watch::Receiver<Life>,
+    /// How often the daemon was greeted.
+    comings: u64,
     /// The question that is being asked.
-    repair: Option<JoinHandle<Vec<Bytes>>>,
+    repair: Option<JoinHandle<Reply>>,
+}
+
+/// What came of a question.
+#[derive(Debug, Default)]
+struct Reply {
+    messages: Vec<Bytes>,
+    /// Why there are none.
+    error: Option<String>,
 }
 
 impl Follower {
     async fn run(mut self) {
         loop {
             tokio::select! {
-                news = self.news.recv() => match news {
-                    Some(News::Message(bytes)) => self.take(&bytes),
-                    Some(News::Comes) => self.greet(),
-                    Some(News::Goes) => self.tell(|state| state.is_alive = false),
+                message = self.messages.recv() => match message {
+                    Some(bytes) => self.take(&bytes),
                     None => return,
                 },
+                Ok(()) = self.lives.changed() => self.look_alive(),
                 reply = answered(&mut self.repair) => {
                     self.repair = None;
-                    self.take_reply(&reply);
+                    self.take_reply(reply);
                 }
             }
         }
@@ -182,18 +198,25 @@ impl Follower {
     }
 
     /// Who comes (back) may be another daemon, or have gone on meanwhile.
-    fn greet(&mut self) {
-        self.ask();
-        self.tell(|state| state.is_alive = true);
+    fn look_alive(&mut self) {
+        let Life { is_alive, comings } = *self.lives.borrow_and_update();
+        if comings != self.comings {
+            self.comings = comings;
+            self.ask();
+        }
+        self.tell(|state| state.is_alive = is_alive);
     }
 
-    fn take_reply(&mut self, reply: &[Bytes]) {
-        let taken = self.mirror.take_reply(reply);
+    fn take_reply(&mut self, Reply { messages, error }: Reply) {
+        let taken = self.mirror.take_reply(&messages);
         // Newer tiles were lost while this came; otherwise the next digest is waited for.
         if taken == Ok(true) && !self.mirror.is_newest() {
             self.ask();
         }
-        self.tell(|state| state.rejected += u64::from(taken.is_err()));
+        self.tell(|state| {
+            state.rejected += u64::from(taken.is_err());
+            state.last_error = error;
+        });
     }
 
     /// Asks for what is missing. What was asked for before may be on a way that is no more.
@@ -232,23 +255,29 @@ struct Asker {
 }
 
 /// Never, while nothing is asked.
-async fn answered(repair: &mut Option<JoinHandle<Vec<Bytes>>>) -> Vec<Bytes> {
+async fn answered(repair: &mut Option<JoinHandle<Reply>>) -> Reply {
     match repair {
         Some(repair) => repair.await.unwrap_or_default(),
         None => std::future::pending().await,
     }
 }
 
-async fn answers(session: &Session, selector: &str) -> Vec<Bytes> {
+async fn answers(session: &Session, selector: &str) -> Reply {
     let query = session.get(selector).timeout(LONGEST_ANSWER);
+    let mut reply = Reply::default();
     // All replies have the same key.
-    let Ok(replies) = query.consolidation(ConsolidationMode::None).await else { return Vec::new() };
-    let mut messages = Vec::new();
-    while let Ok(reply) = replies.recv_async().await {
-        match reply.into_result() {
-            Ok(sample) => messages.push(Bytes::from(sample.payload().to_bytes().into_owned())),
-            Err(error) => tracing::debug!(selector, ?error, "no tiles"),
+    let Ok(replies) = query.consolidation(ConsolidationMode::None).await else { return reply };
+    while let Ok(answer) = replies.recv_async().await {
+        match answer.into_result() {
+            Ok(sample) => {
+                reply.messages.push(Bytes::from(sample.payload().to_bytes().into_owned()));
+            }
+            Err(error) => {
+                let words = String::from_utf8_lossy(&error.payload().to_bytes()).into_owned();
+                tracing::debug!(selector, error = words, "no tiles");
+                reply.error = Some(words);
+            }
         }
     }
-    messages
+    reply
 }

@@ -1,10 +1,13 @@
 //! The documents say what the code does: keys, defaults and files that they name.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
 use gmapd::config::RawConfig;
+use gmapd::daemon::ledger::Verdict;
+use gmapd::daemon::snapshot::State;
+use serde::Serialize;
 use serde_json::Value;
 
 /// Documents whose file names must be there.
@@ -76,6 +79,29 @@ fn paths(line: &str) -> impl Iterator<Item = &str> {
     words.filter(|word| {
         FOLDERS.iter().any(|folder| word.starts_with(folder)) && !word.contains(['<', '*'])
     })
+}
+
+/// The keys of a table of the page's script.
+fn keys_of(table: &str) -> Vec<String> {
+    let script = read("src/cli/view/view.js");
+    let (_, rest) = script.split_once(&format!("const {table} = {{")).expect("it has the table");
+    let (table, _) = rest.split_once("};").expect("the table ends");
+    let keys = table.split(", ").flat_map(|part| part.split(",\n"));
+    let keys = keys.filter_map(|entry| entry.split_once(": \"")).map(|(key, _)| key.trim());
+    keys.map(str::to_owned).collect()
+}
+
+fn names<T: Serialize>(all: &[T]) -> BTreeSet<String> {
+    let name = |of: &T| serde_json::to_value(of).expect("it is JSON");
+    all.iter().map(|of| name(of).as_str().expect("it is a word").to_owned()).collect()
+}
+
+#[test]
+fn the_page_has_words_for_every_verdict_and_a_colour_for_every_state() {
+    for (table, all) in [("VERDICTS", names(&Verdict::ALL)), ("STATES", names(&State::ALL))] {
+        let told: BTreeSet<String> = keys_of(table).into_iter().collect();
+        assert_eq!(told, all, "{table} of the page on the left, the daemon's right");
+    }
 }
 
 #[test]

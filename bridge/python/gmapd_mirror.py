@@ -14,6 +14,7 @@ asked for. `docs/mesh.md` of gmapd describes the messages.
 """
 
 import hashlib
+import math
 import queue
 import struct
 import threading
@@ -161,6 +162,8 @@ class Mirror:
             raise ValueError(f"the message begins with {head.magic!r}, and not with GMT1")
         if not 1 <= head.side <= LARGEST_SIDE or head.width * head.height > LARGEST_MAP:
             raise ValueError(f"no map is like this: {head}")
+        if not (math.isfinite(head.resolution) and head.resolution > 0):
+            raise ValueError(f"no map has cells of {head.resolution} m")
         entries, at = {}, HEAD.size
         for _ in range(head.entries):
             if at + ENTRY.size > len(message):
@@ -254,7 +257,7 @@ class MapMirror:
         self._mirror = Mirror()
         self._map = None
         self._changed = threading.Condition()
-        self._news = queue.Queue(WAITING)
+        self._news = queue.SimpleQueue()
         self._asked = None
         self.is_alive = False
         """Whether the daemon is there."""
@@ -262,6 +265,9 @@ class MapMirror:
         """How often something had to be asked for, the first time included."""
         self.rejected = 0
         """Messages that could not be read."""
+        self.last_error = None
+        """What the daemon said when it refused the last question, or what went wrong here; None
+        since all is well."""
         self._follower = threading.Thread(target=self._follow, name="gmapd-mirror", daemon=True)
         self._follower.start()
         self._tiles = session.declare_subscriber(self._key, self._on_message)
@@ -304,16 +310,11 @@ class MapMirror:
     # Zenoh's threads are never held up: what does not fit is lost, and asked for later.
 
     def _on_message(self, sample):
-        self._hear("message", sample.payload.to_bytes())
+        if self._news.qsize() < WAITING:
+            self._news.put(("message", sample.payload.to_bytes()))
 
     def _on_life(self, sample):
-        self._hear("life", sample.kind == zenoh.SampleKind.PUT)
-
-    def _hear(self, kind, what):
-        try:
-            self._news.put_nowait((kind, what))
-        except queue.Full:
-            pass
+        self._news.put(("life", sample.kind == zenoh.SampleKind.PUT))
 
     def _follow(self):
         while True:
@@ -322,12 +323,18 @@ class MapMirror:
                 return
             try:
                 getattr(self, f"_take_{kind}")(what)
+                self._show()
             except ValueError:
                 self.rejected += 1
-            if (head := self._mirror.head) and (self._map is None or not self._is_shown(head)):
-                with self._changed:
-                    self._map = self._mirror.map()
-                    self._changed.notify_all()
+            except Exception as error:  # noqa: BLE001: who waits for a map is told, and may wait on
+                self.last_error = f"{type(error).__name__}: {error}"
+
+    def _show(self):
+        if (head := self._mirror.head) and (self._map is None or not self._is_shown(head)):
+            map = self._mirror.map()
+            with self._changed:
+                self._map = map
+                self._changed.notify_all()
 
     def _is_shown(self, head):
         return (self._map.run, self._map.version) == (head.run, head.version)
@@ -343,10 +350,10 @@ class MapMirror:
             self._ask()
 
     def _take_reply(self, reply):
-        number, messages = reply
+        number, messages, refusal = reply
         if number != self._asked:
             return
-        self._asked = None
+        self._asked, self.last_error = None, refusal
         # Newer tiles were lost while this came; otherwise the next digest is waited for.
         if self._mirror.take_reply(messages) and not self._mirror.is_newest:
             self._ask()
@@ -358,7 +365,7 @@ class MapMirror:
         selector = f"{self._key}?{self._mirror.question()}"
 
         def ask():
-            messages = []
+            messages, refusal = [], None
             try:
                 replies = self._session.get(
                     selector,
@@ -366,9 +373,13 @@ class MapMirror:
                     consolidation=zenoh.ConsolidationMode.NONE,
                     timeout=LONGEST_ANSWER,
                 )
-                messages = [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
-            except zenoh.ZError:
-                pass
-            self._news.put(("reply", (number, messages)))
+                for reply in replies:
+                    if reply.ok:
+                        messages.append(reply.ok.payload.to_bytes())
+                    else:
+                        refusal = reply.err.payload.to_string()
+            except zenoh.ZError as error:
+                refusal = str(error)
+            self._news.put(("reply", (number, messages, refusal)))
 
         threading.Thread(target=ask, name="gmapd-mirror-ask", daemon=True).start()

@@ -32,24 +32,49 @@ pub(super) struct Answer {
     pub(super) encoding: String,
 }
 
+/// What became of a question.
+#[derive(Debug)]
+pub(super) enum Outcome {
+    Answered(Answer),
+    /// Somebody was asked, and gave no answer in time.
+    Silence,
+    /// There is nobody to ask.
+    Nobody,
+}
+
 /// Asks for a key, with parameters behind a question mark; `None` if nobody answers.
 ///
 /// An answer that says what is wrong is an error with these words.
 pub(super) async fn ask(session: &Session, selector: &str) -> anyhow::Result<Option<Answer>> {
-    let replies = session.get(selector).timeout(PATIENCE).await;
+    match ask_within(session, selector, PATIENCE).await? {
+        Outcome::Answered(answer) => Ok(Some(answer)),
+        Outcome::Silence | Outcome::Nobody => Ok(None),
+    }
+}
+
+/// As [`ask`], for an answer that may take so long.
+pub(super) async fn ask_within(
+    session: &Session,
+    selector: &str,
+    limit: Duration,
+) -> anyhow::Result<Outcome> {
+    let replies = session.get(selector).timeout(limit).await;
     let replies = replies.map_err(|error| anyhow!(error)).context("cannot ask")?;
+    let mut outcome = Outcome::Nobody;
     while let Ok(reply) = replies.recv_async().await {
         match reply.result() {
             Ok(sample) => {
                 let encoding = sample.encoding().to_string();
-                return Ok(Some(Answer { bytes: owned(sample.payload()), encoding }));
+                return Ok(Outcome::Answered(Answer { bytes: owned(sample.payload()), encoding }));
             }
             // Nobody's words, but those of the session that stopped waiting.
-            Err(error) if error.payload().try_to_string().is_ok_and(|text| text == "Timeout") => {}
+            Err(error) if error.payload().try_to_string().is_ok_and(|text| text == "Timeout") => {
+                outcome = Outcome::Silence;
+            }
             Err(error) => bail!("{}", String::from_utf8_lossy(&error.payload().to_bytes())),
         }
     }
-    Ok(None)
+    Ok(outcome)
 }
 
 /// Asks for a key of a robot; nobody answering is an error that tells who would.
@@ -58,22 +83,16 @@ pub(super) async fn ask_robot(
     robot: &Prefix,
     question: (&str, &str),
 ) -> anyhow::Result<Answer> {
-    match ask_who_may_be_gone(session, robot, question).await? {
+    match ask(session, &selector(robot, question)?).await? {
         Some(answer) => Ok(answer),
         None => Err(nobody_answers(robot, question.0, &alive(session).await?)),
     }
 }
 
-/// As [`ask_robot`]; `None` if nobody answers.
-pub(super) async fn ask_who_may_be_gone(
-    session: &Session,
-    robot: &Prefix,
-    (name, parameters): (&str, &str),
-) -> anyhow::Result<Option<Answer>> {
+/// A key of a robot with its parameters.
+pub(super) fn selector(robot: &Prefix, (name, parameters): (&str, &str)) -> anyhow::Result<String> {
     let key = robot.key(name)?;
-    let selector =
-        if parameters.is_empty() { key.to_string() } else { format!("{key}?{parameters}") };
-    ask(session, &selector).await
+    Ok(if parameters.is_empty() { key.to_string() } else { format!("{key}?{parameters}") })
 }
 
 /// What is wrong when a robot does not answer to a key, with those who would.
@@ -170,6 +189,26 @@ fn owned(payload: &ZBytes) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn who_does_not_answer_in_time_is_told_from_nobody() {
+        let config = r#"{ mode: "peer", listen: { endpoints: [] }, scouting: {
+            multicast: { enabled: false }, gossip: { enabled: false } } }"#;
+        block_on(async {
+            let session = zenoh::open(zenoh::Config::from_json5(config).unwrap()).await.unwrap();
+            let (sender, asked) = std::sync::mpsc::channel();
+            let keep = move |query| drop(sender.send(query));
+            session.declare_queryable("slow").callback(keep).background().await.unwrap();
+            let limit = Duration::from_millis(50);
+            let outcome = ask_within(&session, "slow", limit).await?;
+            assert!(matches!(outcome, Outcome::Silence), "{outcome:?}");
+            let outcome = ask_within(&session, "none", limit).await?;
+            assert!(matches!(outcome, Outcome::Nobody), "{outcome:?}");
+            drop(asked);
+            session.close().await.map_err(|error| anyhow!(error))
+        })
+        .unwrap();
+    }
 
     #[test]
     fn a_key_tells_whose_it_is() {

@@ -14,7 +14,10 @@ use super::snapshot::Snapshot;
 use crate::ros;
 use crate::slam::grid::occupancy::OccupancyGrid;
 
-/// Publishes the rectangle of cells that a version changes.
+/// The map that was put as a whole last; `None` while nobody takes it.
+pub(super) type LastPut = watch::Sender<Option<Arc<MapProducts>>>;
+
+/// Publishes the rectangle of cells that differ from the last map that was put as a whole.
 ///
 /// A rectangle is placed in the last map by numbers of cells, so it says nothing where the map has
 /// grown: then `map` alone is published, and the next rectangle is one of that map.
@@ -23,6 +26,7 @@ pub(super) struct UpdatesOutput {
     pub(super) publisher: Arc<Publisher<'static>>,
     pub(super) signature: Signature,
     pub(super) products: Arc<ProductCache>,
+    pub(super) last_put: watch::Receiver<Option<Arc<MapProducts>>>,
     pub(super) map_frame: String,
     /// Between two maps at least.
     pub(super) interval: Duration,
@@ -30,22 +34,22 @@ pub(super) struct UpdatesOutput {
 
 impl UpdatesOutput {
     pub(super) async fn run(self, mut snapshots: watch::Receiver<Arc<Snapshot>>) {
-        let mut last: Option<Arc<MapProducts>> = None;
+        let (mut base, mut told) = (Base::default(), 0);
         snapshots.mark_changed();
         while snapshots.changed().await.is_ok() {
             let snapshot = snapshots.borrow_and_update().clone();
-            let version = snapshot.map.as_ref().map(|map| map.version);
-            let known = last.as_ref().map(|products| products.version());
-            if version.is_none() || version == known {
+            let Some(newest) = snapshot.map.as_ref().filter(|map| map.version != told) else {
                 continue;
-            }
+            };
+            told = newest.version;
             if self.is_wanted().await {
-                let newest = self.products.of(snapshot.map.as_ref());
-                if let Some(before) = last.replace(newest.clone()) {
+                let newest = self.products.of(Some(newest));
+                let put = self.last_put.borrow().clone();
+                if let Some(before) = base.before(put, &newest) {
                     self.put(before, newest).await;
                 }
             } else {
-                last = None;
+                base = Base::default();
             }
             tokio::time::sleep(self.interval).await;
         }
@@ -68,6 +72,34 @@ impl UpdatesOutput {
             }
         };
         spawn_blocking(put).await.ok();
+    }
+}
+
+/// What a rectangle is told beside.
+///
+/// A rectangle may be dropped on its way, so the next one holds its cells as well: both differ from
+/// the same whole map. Where none was put, there is only the version before.
+#[derive(Debug, Default)]
+struct Base {
+    whole: Option<Arc<MapProducts>>,
+    last: Option<Arc<MapProducts>>,
+}
+
+impl Base {
+    /// The map that the newest one is to be told beside; `None` for the first.
+    fn before(
+        &mut self,
+        put: Option<Arc<MapProducts>>,
+        newest: &Arc<MapProducts>,
+    ) -> Option<Arc<MapProducts>> {
+        match put {
+            // The newest itself may have been put already: its rectangle is the same.
+            Some(put) if put.version() < newest.version() => self.whole = Some(put),
+            Some(_) => {}
+            None => self.whole = None,
+        }
+        let last = self.last.replace(newest.clone());
+        self.whole.clone().or(last)
     }
 }
 
@@ -103,7 +135,78 @@ fn update(before: &OccupancyGrid, now: &OccupancyGrid) -> Option<ros::OccupancyG
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::pose::Point2;
+    use crate::daemon::formats::EmptyMap;
+    use crate::daemon::snapshot::MapVersion;
+    use crate::slam::grid::occupancy::{
+        BeamEnd, BeamEndKind, OccupancyMap, OccupiedThreshold, ScanOutline,
+    };
+    use crate::slam::path::Path;
+    use crate::slam::pose::{Point2, Pose2, Stamp};
+
+    /// A version in which a robot in a room of walls of 4 m saw an obstacle at these places.
+    fn products(number: u64, places: &[f32]) -> Arc<MapProducts> {
+        let mut occupancy = OccupancyMap::new(0.1);
+        let mut see = |points: Vec<[f32; 2]>| {
+            let ends = points.into_iter().map(|point| BeamEnd { point, kind: BeamEndKind::Hit });
+            let sensor = Point2::new(0.0, 0.0);
+            let outline = ScanOutline { sensor, ends: ends.collect(), angle_increment: 0.05 };
+            occupancy.add(&outline, Pose2::IDENTITY);
+        };
+        see((0..60).map(|i| (i as f32 * 0.1).sin_cos()).map(|(s, c)| [4.0 * c, 4.0 * s]).collect());
+        see(places.iter().map(|x| [*x, 0.05]).collect());
+        let version = MapVersion {
+            version: number,
+            epoch: 1,
+            stamp: Stamp(1),
+            occupancy,
+            occupied_threshold: OccupiedThreshold::of_share(0.25),
+            path: Path::default(),
+        };
+        let empty = EmptyMap { frame: "map".to_owned(), resolution: 0.1 };
+        Arc::new(MapProducts::new(Some(Arc::new(version)), empty))
+    }
+
+    /// What somebody has who gets a rectangle.
+    fn updated(map: &OccupancyGrid, update: &ros::OccupancyGridUpdate) -> OccupancyGrid {
+        let mut map = map.clone();
+        let cells = serde_json::to_value(&update.data).and_then(serde_json::from_value::<Vec<i8>>);
+        let cells = cells.unwrap();
+        for (row, cells) in (update.y as usize..).zip(cells.chunks_exact(update.width as usize)) {
+            let start = row * map.width + update.x as usize;
+            map.cells[start..start + cells.len()].copy_from_slice(cells);
+        }
+        map
+    }
+
+    #[test]
+    fn a_rectangle_that_was_dropped_is_in_the_next_one() {
+        let versions: Vec<_> = [&[1.05][..], &[1.05, 2.05], &[1.05, 2.05, 3.05]]
+            .into_iter()
+            .zip(1..)
+            .map(|(places, number)| products(number, places))
+            .collect();
+        let mut base = Base::default();
+        let put = Some(versions[0].clone());
+        assert!(base.before(put.clone(), &versions[0]).is_none());
+        let dropped = base.before(put.clone(), &versions[1]).unwrap();
+        assert!(update(dropped.grid(), versions[1].grid()).is_some());
+        let before = base.before(put, &versions[2]).unwrap();
+        let next = update(before.grid(), versions[2].grid()).unwrap();
+        assert_eq!(updated(versions[0].grid(), &next), *versions[2].grid());
+        // Who has the newest already keeps it.
+        assert_eq!(updated(versions[2].grid(), &next), *versions[2].grid());
+    }
+
+    #[test]
+    fn without_whole_maps_rectangles_are_told_beside_the_version_before() {
+        let versions = [1, 2, 3].map(|number| products(number, &[number as f32]));
+        let mut base = Base::default();
+        assert!(base.before(None, &versions[0]).is_none());
+        assert_eq!(base.before(None, &versions[1]).unwrap().version(), 1);
+        let put = Some(versions[1].clone());
+        assert_eq!(base.before(put, &versions[2]).unwrap().version(), 2);
+        assert_eq!(base.before(None, &products(4, &[])).unwrap().version(), 3);
+    }
 
     fn grid(cells: [i8; 12]) -> OccupancyGrid {
         let origin = Point2::new(-1.0, 2.0);

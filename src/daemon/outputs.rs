@@ -23,7 +23,7 @@ use super::answers::{particle_cloud, pose_message};
 use super::diagnostics::diagnostics;
 use super::formats::{MapProducts, ProductCache};
 use super::ledger::Entry;
-use super::map_updates::UpdatesOutput;
+use super::map_updates::{LastPut, UpdatesOutput};
 use super::message_clock::MessageClock;
 use super::ros_node::{Output, RosNode, Signature};
 use super::selector::{MessageFormat, PathFormat, Topic};
@@ -60,6 +60,8 @@ pub(super) struct Declare<'a> {
     pub(super) session: &'a Session,
     /// Learns of each publisher of messages.
     pub(super) node: &'a mut RosNode,
+    /// Tells those who tell what changed since.
+    pub(super) last_put: LastPut,
 }
 
 impl Declare<'_> {
@@ -78,6 +80,7 @@ impl Declare<'_> {
                 publisher: Arc::new(publisher),
                 signature,
                 products: products.clone(),
+                last_put: matches!(kind, Retained::Map).then(|| self.last_put.clone()),
                 interval: settings.map_update_interval,
             };
             tasks.spawn(output.run(snapshots.clone()));
@@ -131,6 +134,7 @@ impl Declare<'_> {
             publisher: Arc::new(declared(key, publisher)?),
             signature,
             products,
+            last_put: self.last_put.subscribe(),
             map_frame: settings.map_frame.clone(),
             interval: settings.map_update_interval,
         };
@@ -336,6 +340,8 @@ struct RetainedOutput {
     publisher: Arc<AdvancedPublisher<'static>>,
     signature: Signature,
     products: Arc<ProductCache>,
+    /// For the whole map.
+    last_put: Option<LastPut>,
     interval: Duration,
 }
 
@@ -370,13 +376,22 @@ impl RetainedOutput {
             if self.is_wanted().await {
                 version = newest.version;
                 let last = content.take().filter(|_| !repeats);
-                content = self.put(self.products.of(Some(newest)), last).await;
+                let products = self.products.of(Some(newest));
+                content = self.put(products.clone(), last).await;
+                self.tell_put(Some(products));
                 rest.set(tokio::time::sleep(self.interval));
                 again.set(tokio::time::sleep(self.interval + AGAIN));
                 waits_for_again = !repeats;
             } else {
+                self.tell_put(None);
                 rest.set(tokio::time::sleep(LOOK));
             }
+        }
+    }
+
+    fn tell_put(&self, products: Option<Arc<MapProducts>>) {
+        if let Some(last_put) = &self.last_put {
+            last_put.send_replace(products);
         }
     }
 

@@ -165,7 +165,8 @@ impl Serving {
         let run = run_number(&session.zid().to_string(), clock::unix_nanoseconds());
         let responder =
             Arc::new(Responder::new(&settings, run, snapshots.clone(), status.clone(), commands));
-        let mut declare = outputs::Declare { session, node: &mut node };
+        let mut declare =
+            outputs::Declare { session, node: &mut node, last_put: watch::Sender::default() };
         let mut tasks = JoinSet::new();
         declare.maps(&settings, &snapshots, &responder.products(), &mut tasks).await?;
         declare.tiles(&settings, &snapshots, responder.tiles(), &mut tasks).await?;

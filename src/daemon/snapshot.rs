@@ -96,3 +96,16 @@ pub enum State {
     /// By command.
     Paused,
 }
+
+impl State {
+    /// All states, in the order above.
+    pub const ALL: [Self; 7] = [
+        Self::WaitingForScans,
+        Self::WaitingForOdometry,
+        Self::NotLocalized,
+        Self::Mapping,
+        Self::Localizing,
+        Self::Degraded,
+        Self::Paused,
+    ];
+}

@@ -151,12 +151,6 @@ impl TileSet {
         self.head.extent = known.fold(Extent::default(), |extent, held| extent.union(held.extent));
     }
 
-    /// What tells which map is the newest.
-    #[must_use]
-    pub fn digest(&self) -> Vec<Bytes> {
-        Message::pack(self.head, [])
-    }
-
     /// The tiles that changed after this version, those that are gone included.
     #[must_use]
     pub fn since(&self, version: u64) -> Vec<Bytes> {
@@ -185,6 +179,12 @@ impl TileSet {
         });
         Message::pack(self.head, entries)
     }
+}
+
+/// What tells which map is the newest.
+#[must_use]
+pub fn digest(head: Head) -> Vec<Bytes> {
+    Message::pack(head, [])
 }
 
 impl Held {
@@ -241,12 +241,18 @@ fn known_part(cells: &[i8], key: TileKey, row: usize) -> Extent {
 #[derive(Debug)]
 pub(super) struct TileStore {
     snapshots: watch::Receiver<Arc<Snapshot>>,
+    first: Head,
     tiles: Mutex<TileSet>,
 }
 
 impl TileStore {
     pub(super) const fn new(tiles: TileSet, snapshots: watch::Receiver<Arc<Snapshot>>) -> Self {
-        Self { snapshots, tiles: Mutex::new(tiles) }
+        Self { snapshots, first: *tiles.head(), tiles: Mutex::new(tiles) }
+    }
+
+    /// What the tiles began with.
+    const fn first(&self) -> Head {
+        self.first
     }
 
     /// Brings the tiles up to date, and takes something from them. It may take milliseconds.
@@ -256,11 +262,6 @@ impl TileStore {
         let snapshot = self.snapshots.borrow().clone();
         tiles.update(snapshot.map.as_ref());
         take(&tiles)
-    }
-
-    /// What was newest when somebody asked last.
-    pub(super) fn digest(&self) -> Vec<Bytes> {
-        self.tiles.lock().unwrap_or_else(PoisonError::into_inner).digest()
     }
 }
 

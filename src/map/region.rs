@@ -143,16 +143,15 @@ impl Region {
         let first = |low: f64| libm::floor(low / resolution + ON_EDGE);
         let end = |high: f64| libm::ceil(high / resolution - ON_EDGE);
         let (x, y) = (first(window.low.x), first(window.low.y));
-        let (width, height) = (end(window.high.x) - x, end(window.high.y) - y);
+        // What is thinner than the leeway at edges lies in a cell as well.
+        let least = |low: f64, high: f64| if low < high { 1.0 } else { 0.0 };
+        let width = (end(window.high.x) - x).max(least(window.low.x, window.high.x));
+        let height = (end(window.high.y) - y).max(least(window.low.y, window.high.y));
         if width * height > MOST_CELLS as f64 {
             return Err(RegionError::TooLarge { width, height, resolution });
         }
-        let extent = Extent {
-            ix: x as i32,
-            iy: y as i32,
-            width: width.max(0.0) as u32,
-            height: height.max(0.0) as u32,
-        };
+        let extent =
+            Extent { ix: x as i32, iy: y as i32, width: width as u32, height: height as u32 };
         Ok(Self { extent, factor: factor as i32, resolution })
     }
 
@@ -402,6 +401,16 @@ mod tests {
         assert_eq!((grid.width, grid.height), (10, 6));
         let row = &grid.cells[30..40];
         assert_eq!(row, [-1, -1, -1, -1, -1, 0, 0, 100, -1, -1]);
+    }
+
+    #[test]
+    fn the_thinnest_window_has_a_cell_and_that_of_no_map_has_none() {
+        for (low, high) in [([0.0, 0.0], [1e-8, 0.1]), ([0.1 - 1e-9, 0.0], [0.1 + 1e-9, 0.1])] {
+            let region = Region::new(window(low, high), FINE, FINE).unwrap();
+            assert_eq!((region.extent.width, region.extent.height), (1, 1));
+        }
+        let region = Region::new(window([0.0, 0.0], [0.0, 0.0]), FINE, FINE).unwrap();
+        assert_eq!((region.extent.width, region.extent.height), (0, 0));
     }
 
     #[test]

@@ -2,10 +2,12 @@
 
 import hashlib
 import json
+import math
 import random
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 
@@ -17,6 +19,10 @@ from conftest import PATIENCE, free_endpoint, open_session, until
 SOURCES = Path(__file__).parent.parent.parent / "bridge" / "python"
 sys.path.append(str(SOURCES))
 from gmapd_mirror import ENTRY, HEAD, MapMirror, Mirror  # noqa: E402
+
+
+# How often the daemon tells which version is the newest, s.
+DIGEST_PERIOD = 1.0
 
 
 def same_map(client, map):
@@ -52,18 +58,18 @@ def test_the_mirror_follows_resets_and_new_maps(start):
         assert mirror.map.epoch > epoch and mirror.map.cells.size > 0
 
 
-def test_a_third_of_all_samples_may_be_lost(start):
+def test_after_thirty_percent_were_lost_the_mirror_is_right_within_a_digest_period(start):
     """Between two sessions that do not know each other, messages are forwarded, most of them."""
     _, client = start(settings=["map_update_interval=0"])
     endpoint = free_endpoint()
     far_side = open_session("peer", listen=endpoint)
     far = open_session("client", connect=endpoint)
     chance = random.Random(3)
-    lost = 0
+    share, lost = 0.3, 0
 
     def forward(sample):
         nonlocal lost
-        if chance.random() < 0.3:
+        if chance.random() < share:
             lost += 1
         else:
             far_side.put(sample.key_expr, sample.payload)
@@ -80,8 +86,11 @@ def test_a_third_of_all_samples_may_be_lost(start):
     token = far_side.liveliness().declare_token("robot01/slam/alive")
     with MapMirror(far, "robot01") as mirror:
         client.feed(rb.route())
-        until_same(client, mirror)
         assert lost > 0, "something was lost"
+        share = 0
+        end = time.monotonic()
+        until_same(client, mirror)
+        assert time.monotonic() - end < DIGEST_PERIOD + 1
     token.undeclare()
     far.close()
     far_side.close()
@@ -137,6 +146,33 @@ def test_what_cannot_be_read_changes_nothing():
             mirror.take(broken)
     assert mirror.newest is None and mirror.map() is None
     assert mirror.take(good) == Mirror.NEWEST
+
+
+def test_a_resolution_that_no_map_has_is_refused():
+    good = message(1, {(0, 0): 100})
+    for resolution in [0.0, -0.05, math.nan, math.inf]:
+        with pytest.raises(ValueError, match="cells of"):
+            Mirror().take(good[:40] + struct.pack("<d", resolution) + good[48:])
+
+
+def test_what_goes_wrong_is_told_and_the_mirror_goes_on(mapped):
+    _, client = mapped
+    with MapMirror(client.session, "robot01") as mirror:
+        until_same(client, mirror)
+        take = mirror._mirror.take
+
+        def fail(message):
+            mirror._mirror.take = take
+            raise MemoryError("too large")
+
+        mirror._mirror.take = fail
+        # The next digest fails, and the one after it is read.
+        until(lambda: mirror.last_error, "the error")
+        assert mirror.last_error == "MemoryError: too large"
+        version = mirror.map.version
+        client.feed((seconds + 100, pose) for seconds, pose in rb.route())
+        until_same(client, mirror)
+        assert mirror.map.version > version
 
 
 def test_the_example_writes_a_picture(mapped, tmp_path):

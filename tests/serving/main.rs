@@ -18,6 +18,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
 
 mod rig;
+mod router;
 #[path = "../support/mod.rs"]
 mod support;
 mod tiles;

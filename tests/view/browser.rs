@@ -21,6 +21,8 @@ pub(crate) struct Browser {
     calls: u64,
     /// What pages complained about.
     complaints: Vec<String>,
+    /// What pages asked; they are answered with yes.
+    questions: Vec<String>,
     _process: Background,
     _profile: TempDir,
 }
@@ -39,7 +41,14 @@ impl Browser {
         if let MaybeTlsStream::Plain(stream) = tools.get_ref() {
             stream.set_read_timeout(Some(PATIENCE)).expect("any time will do");
         }
-        Self { tools, calls: 0, complaints: Vec::new(), _process: process, _profile: profile }
+        Self {
+            tools,
+            calls: 0,
+            complaints: Vec::new(),
+            questions: Vec::new(),
+            _process: process,
+            _profile: profile,
+        }
     }
 
     /// A page of the size of a screen.
@@ -59,26 +68,39 @@ impl Browser {
     }
 
     fn call(&mut self, session: &str, method: &str, parameters: &Value) -> Value {
+        let id = self.send(session, method, parameters);
+        loop {
+            let message = self.tools.read();
+            let message = message.unwrap_or_else(|error| panic!("{method} {parameters}: {error}"));
+            let Ok(text) = message.into_text() else { continue };
+            let mut answer: Value = serde_json::from_str(&text).unwrap_or_default();
+            if answer["id"] == id {
+                assert_eq!(answer["error"], Value::Null, "{method} {parameters}");
+                return answer["result"].take();
+            }
+            match answer["method"].as_str().unwrap_or_default() {
+                "Runtime.exceptionThrown" | "Log.entryAdded" => {
+                    self.complaints.push(answer["params"].to_string());
+                }
+                // The script waits for an answer, and so does the call.
+                "Page.javascriptDialogOpening" => {
+                    let question = answer["params"]["message"].as_str().unwrap_or_default();
+                    self.questions.push(question.to_owned());
+                    self.send(session, "Page.handleJavaScriptDialog", &json!({ "accept": true }));
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn send(&mut self, session: &str, method: &str, parameters: &Value) -> u64 {
         self.calls += 1;
         let mut call = json!({ "id": self.calls, "method": method, "params": parameters });
         if !session.is_empty() {
             call["sessionId"] = session.into();
         }
         self.tools.send(Message::text(call.to_string())).expect("the browser listens");
-        loop {
-            let message = self.tools.read();
-            let message = message.unwrap_or_else(|error| panic!("{method} {parameters}: {error}"));
-            let Ok(text) = message.into_text() else { continue };
-            let mut answer: Value = serde_json::from_str(&text).unwrap_or_default();
-            if answer["id"] == self.calls {
-                assert_eq!(answer["error"], Value::Null, "{method} {parameters}");
-                return answer["result"].take();
-            }
-            let event = answer["method"].as_str().unwrap_or_default();
-            if ["Runtime.exceptionThrown", "Log.entryAdded"].contains(&event) {
-                self.complaints.push(answer["params"].to_string());
-            }
-        }
+        self.calls
     }
 }
 
@@ -165,6 +187,11 @@ impl Page {
         let picture = decoded(picture["data"].as_str().expect("a picture is text"));
         assert!(picture.starts_with(b"\x89PNG"), "{name}");
         fs::write(folder.join(format!("{name}.png")), picture).expect("it takes files");
+    }
+
+    /// What the page asked, each of it answered with yes.
+    pub(crate) fn questions(&self) -> Vec<String> {
+        self.browser.questions.clone()
     }
 
     /// Errors of scripts, and what the browser refused.

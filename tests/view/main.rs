@@ -132,19 +132,57 @@ fn maps_are_downloaded_as_the_robot_has_them() {
     let daemon = mapped();
     let view = View::on_loopback(&daemon);
     let directory = directory();
+    let version = status(&daemon)["map"]["version"].clone();
     for format in ["png", "pgm", "yaml"] {
         let answer = view.get(&format!("/map/{format}?robot=robot01"));
         assert_eq!(answer.status, 200, "{}", answer.text());
-        let name = format!("attachment; filename=\"map.{format}\"");
+        let stem = if format == "png" { "robot01" } else { &format!("robot01-v{version}") };
+        let name = format!("attachment; filename=\"{stem}.{format}\"");
         assert_eq!(answer.header("content-disposition"), name);
         let path: PathBuf = directory.path().join(format!("map.{format}"));
         succeed(&["get", "-e", &daemon.endpoint, "robot01", "map", "-o", text(&path)]);
-        assert_eq!(answer.body, fs::read(&path).expect("it was written"), "{format}");
+        let mut expected = fs::read(&path).expect("it was written");
+        if format == "yaml" {
+            // It names the picture that goes with it.
+            let text = String::from_utf8(expected).expect("it is text");
+            expected = text.replace("map.pgm", &format!("{stem}.pgm")).into_bytes();
+        }
+        assert_eq!(answer.body, expected, "{format}");
     }
     assert_eq!(view.get("/map/exe?robot=robot01").status, 404);
-    let answer = view.get("/map/png?robot=robot02");
-    assert_eq!(answer.status, 502);
-    assert!(answer.text().contains("alive are: robot01"), "{}", answer.text());
+    for format in ["png", "pgm"] {
+        let answer = view.get(&format!("/map/{format}?robot=robot02"));
+        assert_eq!(answer.status, 502);
+        assert!(answer.text().contains("alive are: robot01"), "{}", answer.text());
+    }
+}
+
+#[test]
+fn a_page_that_is_told_nothing_is_asked_whether_it_is_there() {
+    let daemon = Daemon::start("robot01");
+    let view = View::on_loopback(&daemon);
+    let mut socket = view.socket("").expect("it is let in");
+    while !matches!(socket.message(), Message::Ping(_)) {}
+}
+
+#[test]
+fn the_demo_shows_its_page() {
+    let directory = directory();
+    let mut command = program();
+    command.args(["demo", "--view", "--seconds", "5"]).current_dir(directory.path());
+    let mut demo = Background::start(&mut command);
+    let line = demo.line_with("look at it: http://");
+    let url = line.split_once(": ").expect("it ends with an address").1.to_owned();
+    let view = View { background: demo, url };
+    assert!(view.get("/").text().contains("<canvas"));
+    let mut socket = view.socket("?robot=robot01").expect("it is let in");
+    socket.wait("pose", |pose| pose["x"].is_number());
+    view.background.line_with("the page is there until Ctrl-C");
+    assert_eq!(view.get("/").status, 200);
+    demo = view.background;
+    demo.interrupt();
+    assert_eq!(demo.exit_code(), Some(0));
+    assert!(directory.path().join("demo/map.pgm").exists());
 }
 
 #[test]
@@ -331,4 +369,116 @@ fn the_page_shows_a_robot_until_it_is_gone() {
     page.until("document.querySelector('[data-command=save]').disabled");
     page.screenshot("gone");
     assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+/// Counts what is drawn from now on, by colour.
+const COUNT_DRAWING: &str = "(() => {
+    window.drawn = {};
+    const canvas = CanvasRenderingContext2D.prototype;
+    for (const [name, style] of
+        [['fill', 'fillStyle'], ['fillRect', 'fillStyle'], ['stroke', 'strokeStyle']]) {
+        const draw = canvas[name];
+        canvas[name] = function (...values) {
+            drawn[this[style]] = (drawn[this[style]] ?? 0) + 1;
+            return draw.apply(this, values);
+        };
+    }
+    return true;
+})()";
+
+#[test]
+fn layers_appear_and_vanish_with_their_boxes() {
+    let daemon = Daemon::start("robot01");
+    let view = View::on_loopback(&daemon);
+    let mut page = Browser::start().open(&view.url);
+    page.until("document.querySelector('nav a[aria-current]')?.textContent === 'robot01'");
+    page.until(COUNT_DRAWING);
+    let directory = directory();
+    let log = simulated_log(&directory);
+    let mut play = program();
+    play.args(["play", "-e", &daemon.endpoint, text(&log)]);
+    play.args(["--prefix", "robot01", "--rate", "4"]);
+    let _play = Background::start(&mut play);
+    let colour = |layer: &str| {
+        format!("getComputedStyle(document.documentElement).getPropertyValue('--{layer}').trim()")
+    };
+    let count = |layer: &str| format!("(drawn[{}] ?? 0)", colour(layer));
+    // The robot itself has the colour of its path, and white around it.
+    for layer in ["scan", "particles", "path", "accent"] {
+        page.until(&format!("{} > 0", count(layer)));
+    }
+    page.screenshot("layers");
+    let robots = "(drawn['#ffffff'] ?? 0)";
+    for layer in ["scan", "particles", "path"] {
+        let only_robots = if layer == "path" { robots } else { "0" };
+        page.until(&format!(
+            "(document.querySelector('[data-layer={layer}]').click(), drawn = {{}}, true)"
+        ));
+        page.until(&format!("{robots} > 2"));
+        assert_eq!(page.until(&format!("({} === {only_robots}) + 1", count(layer))), 2, "{layer}");
+        page.click(&format!("[data-layer={layer}]"));
+        page.until(&format!("{} > {only_robots}", count(layer)));
+    }
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[test]
+fn of_two_robots_the_chosen_one_is_shown_and_reset() {
+    let daemon = mapped();
+    let mut command = program();
+    command.args(["run", "--prefix", "robot02", "-e", &daemon.endpoint, "--threads", "1"]);
+    let second = Background::start(&mut command);
+    let view = View::on_loopback(&daemon);
+    let mut page = Browser::start().open(&format!("{}?robot=robot01", view.url));
+    page.until("document.querySelectorAll('nav a').length === 2");
+    let chosen =
+        |name| format!("document.querySelector('[aria-current]')?.textContent === '{name}'");
+    let facts = "document.querySelector('#facts dd')?.textContent";
+    page.until(&format!("{} && /m² known/.test({facts})", chosen("robot01")));
+    page.click("nav a:not([aria-current])");
+    page.until(&format!("{} && {facts} === 'none yet'", chosen("robot02")));
+    page.until("location.search === '?robot=robot02'");
+    page.click("nav a:not([aria-current])");
+    page.until(&format!("{} && /m² known/.test({facts})", chosen("robot01")));
+
+    page.click("[data-command=reset]");
+    page.until(&format!("{facts} === 'none yet'"));
+    page.until("said.textContent.startsWith('map and path are forgotten')");
+    assert_eq!(page.questions(), ["Forget the map of robot01?"]);
+    second.interrupt();
+    page.until("document.querySelector('nav a.gone')?.textContent === 'robot02'");
+    page.screenshot("two-robots");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[test]
+fn a_page_whose_server_comes_back_has_one_socket() {
+    let daemon = mapped();
+    let view = View::on_loopback(&daemon);
+    let mut page = Browser::start().open(&format!("{}?robot=robot01", view.url));
+    page.until("/m² known/.test(document.querySelector('#facts dd')?.textContent)");
+    // Another robot is chosen while the page waits to connect once more.
+    page.until(
+        "(() => {
+            window.opened = 0;
+            const Socket = WebSocket;
+            window.WebSocket = class extends Socket {
+                constructor(address) { super(address); opened += 1; window.newest = this; }
+            };
+            document.querySelector('nav a').click();
+            return true;
+        })()",
+    );
+    page.until("newest.readyState === WebSocket.OPEN");
+    page.until(
+        "new Promise((resolve) => {
+            newest.addEventListener('close', () => {
+                document.querySelector('nav a').click();
+                // Longer than the page waits to connect once more.
+                setTimeout(resolve, 1500, true);
+            });
+            newest.close();
+        })",
+    );
+    assert_eq!(page.until("newest.readyState === WebSocket.OPEN && opened"), 2);
 }

@@ -8,8 +8,9 @@ mod robot;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, anyhow, ensure};
 use axum::extract::{Json, Path, Query, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::middleware::{self, Next};
@@ -17,15 +18,20 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{get, post};
 use clap::Args;
 use gmapd::daemon::keys::Prefix;
+use gmapd::map;
 use serde::Deserialize;
 use tokio::net::TcpListener;
+use tokio::time::timeout;
 use zenoh::Session;
 
 use self::fleet::Fleet;
 use self::guard::Guard;
-use super::mesh;
+use super::mesh::{self, Outcome};
 use super::session::SessionArguments;
 use super::signals::Signals;
+
+/// A robot saves, and a large map comes through a slow network, in less.
+const LONGEST_ANSWER: Duration = Duration::from_secs(60);
 
 /// Where the mesh is, and where the page is to be.
 #[derive(Debug, Args)]
@@ -123,11 +129,17 @@ struct Whom {
     robot: Option<String>,
 }
 
+impl Whom {
+    fn robot(&self) -> anyhow::Result<Prefix> {
+        Ok(Prefix::parse(self.robot.as_deref().context("no robot is named")?)?)
+    }
+}
+
 fn router(site: Arc<Site>) -> axum::Router {
     let guarded = middleware::from_fn_with_state(site.clone(), guarded);
     axum::Router::new()
         .route("/socket", get(socket))
-        .route("/map/{format}", get(map))
+        .route("/map/{format}", get(download))
         .route("/command/{name}", post(command))
         .route_layer(guarded)
         .route("/", get(|| async { Html(include_str!("index.html")) }))
@@ -173,22 +185,62 @@ async fn socket(
     upgrade.on_upgrade(move |socket| page::talk(socket, fleet, robot))
 }
 
-async fn map(
+async fn download(
     State(site): State<Arc<Site>>,
     Path(format): Path<String>,
     Query(whom): Query<Whom>,
 ) -> Response {
-    if !["png", "pgm", "yaml"].contains(&format.as_str()) {
-        let reason = format!("a map is png, pgm or yaml, not {format:?}");
-        return (StatusCode::NOT_FOUND, reason).into_response();
-    }
-    match asked(&site, &whom, ("map", &format!("format={format}"))).await {
-        Ok(bytes) => {
-            let name = format!("attachment; filename=\"map.{format}\"");
+    let file = match format.as_str() {
+        "png" => picture(&site, &whom).await,
+        "pgm" | "yaml" => file_of_map(&site, &whom, &format).await,
+        _ => {
+            let reason = format!("a map is png, pgm or yaml, not {format:?}");
+            return (StatusCode::NOT_FOUND, reason).into_response();
+        }
+    };
+    match file {
+        Ok((name, bytes)) => {
+            let name = format!("attachment; filename=\"{name}\"");
             ([(header::CONTENT_DISPOSITION, name)], bytes).into_response()
         }
         Err(error) => (StatusCode::BAD_GATEWAY, format!("{error:#}")).into_response(),
     }
+}
+
+/// Name and bytes of a file.
+type Download = (String, Vec<u8>);
+
+async fn picture(site: &Site, whom: &Whom) -> anyhow::Result<Download> {
+    let bytes = asked(site, whom, ("map", "format=png")).await?;
+    Ok((format!("{}.png", file_stem(&whom.robot()?)), bytes))
+}
+
+/// The map that pages show. The picture and what goes with it are asked for one after the other:
+/// both have the version in their names, and the one names the other.
+async fn file_of_map(site: &Site, whom: &Whom, format: &str) -> anyhow::Result<Download> {
+    let robot = whom.robot()?;
+    // Whoever is not there is told of at once.
+    asked(site, whom, ("map_metadata", "")).await?;
+    let watched = site.fleet.watch(&robot).await?;
+    let mut states = watched.mirror.states();
+    let whole = timeout(LONGEST_ANSWER, states.wait_for(|state| state.is_newest)).await;
+    let map = whole.map_err(|_| silence(&robot, "slam/tiles"))??.map.clone();
+    let grid = map.grid();
+    ensure!(!grid.cells.is_empty(), "there is no map yet");
+    let stem = format!("{}-v{}", file_stem(&robot), map.version());
+    let image = format!("{stem}.pgm");
+    if format == "pgm" {
+        return Ok((image, map::pgm(&grid)));
+    }
+    Ok((format!("{stem}.yaml"), map::yaml(&grid, &image).into_bytes()))
+}
+
+/// A robot's name as one of a file.
+fn file_stem(robot: &Prefix) -> String {
+    let name = robot.to_string();
+    let allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_.".contains(letter);
+    let name = name.replace(|letter| !allowed(letter), "-");
+    if name.is_empty() { "map".to_owned() } else { name }
 }
 
 /// Parameters of a command; those that it does not know the daemon refuses.
@@ -222,9 +274,29 @@ async fn command(
 }
 
 async fn asked(site: &Site, whom: &Whom, question: (&str, &str)) -> anyhow::Result<Vec<u8>> {
-    let robot = Prefix::parse(whom.robot.as_deref().context("no robot is named")?)?;
-    match mesh::ask_who_may_be_gone(site.fleet.session(), &robot, question).await? {
-        Some(answer) => Ok(answer.bytes),
-        None => Err(mesh::nobody_answers(&robot, question.0, &site.fleet.alive())),
+    let robot = whom.robot()?;
+    let selector = mesh::selector(&robot, question)?;
+    match mesh::ask_within(site.fleet.session(), &selector, LONGEST_ANSWER).await? {
+        Outcome::Answered(answer) => Ok(answer.bytes),
+        Outcome::Silence => Err(silence(&robot, question.0)),
+        Outcome::Nobody => Err(mesh::nobody_answers(&robot, question.0, &site.fleet.alive())),
+    }
+}
+
+fn silence(robot: &Prefix, name: &str) -> anyhow::Error {
+    let (robot, limit) = (mesh::name(robot), LONGEST_ANSWER.as_secs());
+    anyhow!("{robot} gave no answer to {name} within {limit} s")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn robots_names_become_those_of_files() {
+        let stem = |name| file_stem(&Prefix::parse(name).unwrap());
+        assert_eq!(stem("robot01"), "robot01");
+        assert_eq!(stem("site/robot.1"), "site-robot.1");
+        assert_eq!(stem(""), "map");
     }
 }

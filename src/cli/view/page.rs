@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use gmapd::client::MirrorState;
 use gmapd::daemon::keys::Prefix;
@@ -11,13 +12,19 @@ use gmapd::map::mirror::MirroredMap;
 use gmapd::map::tiles::{self, TileIndex};
 use serde_json::{Value, json};
 use tokio::sync::watch;
-use tokio::time::timeout;
+use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use super::fleet::{Fleet, Robots};
 use super::robot::Scene;
 
 /// A page that takes nothing for so long is gone, and opens the socket anew if it is not.
 const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Between pings. A phone that is out of reach says nothing, and its socket stays open.
+const PING_PERIOD: Duration = Duration::from_secs(20);
+
+/// So many pings without a sign of life, and the page is gone.
+const MOST_UNANSWERED: u32 = 2;
 
 /// Tells a page who is there, and about a robot, until it is closed.
 ///
@@ -60,16 +67,43 @@ impl Heard {
 }
 
 /// The page is gone, or as good as gone.
+#[derive(Debug, Clone, PartialEq, Eq)]
 struct Gone;
+
+/// Whether a page answers.
+#[derive(Debug, Default)]
+struct Pulse {
+    unanswered: u32,
+}
+
+impl Pulse {
+    fn ping(&mut self) -> Result<Message, Gone> {
+        if self.unanswered == MOST_UNANSWERED {
+            return Err(Gone);
+        }
+        self.unanswered += 1;
+        Ok(Message::Ping(Bytes::new()))
+    }
+}
 
 async fn tell(socket: &mut WebSocket, mut heard: Heard) -> Result<(), Gone> {
     let mut sent = Sent::default();
+    let mut pulse = Pulse::default();
+    let mut pings = interval(PING_PERIOD);
+    pings.reset();
+    pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         let messages = tokio::select! {
+            // What the page has answered is read before it is missed.
+            biased;
             message = socket.recv() => match message {
-                Some(Ok(_)) => Vec::new(),
+                Some(Ok(_)) => {
+                    pulse = Pulse::default();
+                    Vec::new()
+                }
                 Some(Err(_)) | None => return Err(Gone),
             },
+            _ = pings.tick() => vec![pulse.ping()?],
             Ok(()) = heard.robots.changed() => {
                 vec![text(&robots(&heard.robots.borrow_and_update()))]
             }
@@ -135,5 +169,17 @@ impl Sent {
         messages.extend(packed.into_iter().map(Message::Binary));
         self.tiles = tiles;
         messages
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_that_answers_no_ping_is_gone() {
+        let mut pulse = Pulse::default();
+        let ping = Ok(Message::Ping(Bytes::new()));
+        assert_eq!([pulse.ping(), pulse.ping(), pulse.ping()], [ping.clone(), ping, Err(Gone)]);
     }
 }

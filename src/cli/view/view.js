@@ -7,7 +7,7 @@ const context = canvas.getContext("2d");
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
 let robot = parameters.get("robot");
-let socket, robots = [], tool = null, drag = null;
+let socket, retry, robots = [], tool = null, drag = null;
 // What is known of the robot.
 let scene = {}, trail = [], tiles = new Map(), head = null;
 // Tiles of a version that is not whole yet, and whether it has none of those before.
@@ -22,6 +22,7 @@ const isAlive = () => robots.some(({ name, is_alive }) => name === robot && is_a
 // --- What comes ---
 
 function connect() {
+  clearTimeout(retry);
   const address = new URL(`socket?${query(robot !== null && { robot })}`, location);
   address.protocol = location.protocol.replace("http", "ws");
   const mine = socket = new WebSocket(address);
@@ -37,7 +38,7 @@ function connect() {
     showState("bad", "not connected", hasNews ? "gmapd view has ended." :
       "gmapd view does not answer, or wants the address that it printed, with its token.");
     element("map").classList.add("gone");
-    setTimeout(connect, 1000);
+    retry = setTimeout(connect, 1000);
   };
 }
 
@@ -118,13 +119,17 @@ async function takeTiles(buffer) {
 const VERDICTS = {
   processed: "in the map", not_moved_enough: "not moved enough since the last in the map",
   throttled: "left out, as throttle_scans says", no_usable_beams: "without a usable beam",
-  bad_odometry: "with odometry that makes no sense", no_odometry: "without odometry",
+  bad_odometry: "with odometry that makes no sense",
+  not_localized: "whose place in the map cannot be told", no_odometry: "without odometry",
   no_mount: "from a laser whose place is not known", tilted_mount: "from a tilted laser",
   bad_geometry: "whose angles or ranges make no sense", not_decodable: "that cannot be read",
   duplicate: "that came twice", late: "that came after a newer one",
   overload: "too many to keep up with", paused: "while paused",
 };
-const STATES = { mapping: "good", paused: "warning", degraded: "bad" };
+const STATES = {
+  waiting_for_scans: "warning", waiting_for_odometry: "warning", not_localized: "warning",
+  mapping: "good", localizing: "good", degraded: "bad", paused: "warning",
+};
 const words = (name) => name.replaceAll("_", " ");
 
 function show() {

@@ -11,13 +11,17 @@ use zenoh::Wait as _;
 use zenoh::pubsub::Publisher;
 
 use super::super::snapshot::Snapshot;
-use super::TileStore;
+use super::{TileStore, digest};
+use crate::map::tiles::Head;
 
 /// How often it is told which version is the newest. Who has missed the last change finds it out
 /// within this time.
 pub const DIGEST_PERIOD: Duration = Duration::from_secs(1);
 
 /// Publishes what each version of the map changes, and repeats which version that is.
+///
+/// Who asks may get a newer version than was published. The others are not told of it before its
+/// tiles are: they would ask for it, each of them.
 #[derive(Debug)]
 pub(in super::super) struct TilesOutput {
     pub(in super::super) publisher: Arc<Publisher<'static>>,
@@ -28,7 +32,7 @@ pub(in super::super) struct TilesOutput {
 
 impl TilesOutput {
     pub(in super::super) async fn run(self, mut snapshots: watch::Receiver<Arc<Snapshot>>) {
-        let (mut told, mut seen) = (0, None);
+        let (mut told, mut seen) = (self.tiles.first(), None);
         let mut digests = tokio::time::interval(DIGEST_PERIOD);
         digests.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let rest = tokio::time::sleep(Duration::ZERO);
@@ -49,32 +53,32 @@ impl TilesOutput {
                     }
                 }
                 () = &mut rest, if !rest.is_elapsed() => {}
-                _ = digests.tick() => self.put(|tiles| tiles.digest()).await,
+                _ = digests.tick() => self.repeat(told).await,
             }
         }
     }
 
     /// Tells what has changed since a version; returns the one that is told now.
-    async fn tell_changes(&self, told: u64) -> u64 {
+    async fn tell_changes(&self, told: Head) -> Head {
         let wanted = self.is_wanted().await;
         let (tiles, publisher) = (self.tiles.clone(), self.publisher.clone());
         let tell = move || {
-            let (version, messages) = tiles.newest(|tiles| {
-                let version = tiles.head().version;
-                let is_new = wanted && version != told;
-                (version, if is_new { tiles.since(told) } else { Vec::new() })
+            let (head, messages) = tiles.newest(|tiles| {
+                let head = *tiles.head();
+                let is_new = wanted && head.version != told.version;
+                (head, if is_new { tiles.since(told.version) } else { Vec::new() })
             });
             put_all(&publisher, messages);
-            version
+            head
         };
         spawn_blocking(tell).await.unwrap_or(told)
     }
 
-    async fn put(&self, messages: impl Fn(&TileStore) -> Vec<Bytes>) {
+    /// Says once more which version was told last.
+    async fn repeat(&self, told: Head) {
         if self.is_wanted().await {
-            let messages = messages(&self.tiles);
             let publisher = self.publisher.clone();
-            spawn_blocking(move || put_all(&publisher, messages)).await.ok();
+            spawn_blocking(move || put_all(&publisher, digest(told))).await.ok();
         }
     }
 
