@@ -228,7 +228,13 @@ impl Robot {
         let (verdicts, heard) = broadcast::channel(16);
         let (commander, commands) = mpsc::channel(16);
         let status = AskStatus::new(status);
-        let sources = Sources { snapshots: watched, verdicts: heard, commands: commander, status };
+        let sources = Sources {
+            snapshots: watched,
+            verdicts: heard,
+            commands: commander,
+            status,
+            refusals: Arc::default(),
+        };
         let prefix = Prefix::parse(&robot_name(number)).expect("it is a key");
         let node = RosNode::new(session.zid().to_string(), prefix, Convention::Bridge);
         let serving = Serving::start(&session, node, settings, sources).await;
@@ -277,6 +283,7 @@ fn status() -> Status {
         inputs: BTreeMap::new(),
         milliseconds_per_scan: None,
         real_time_factor: None,
+        refused: BTreeMap::new(),
         scans_waiting: 0,
         filter: FilterStatus::default(),
         map: None,

@@ -224,7 +224,7 @@ async fn file_of_map(site: &Site, whom: &Whom, format: &str) -> anyhow::Result<D
     let watched = site.fleet.watch(&robot).await?;
     let mut states = watched.mirror.states();
     let whole = timeout(LONGEST_ANSWER, states.wait_for(|state| state.is_newest)).await;
-    let map = whole.map_err(|_| silence(&robot, "slam/tiles"))??.map.clone();
+    let map = whole.map_err(|_elapsed| silence(&robot, "slam/tiles"))??.map.clone();
     let grid = map.grid();
     ensure!(!grid.cells.is_empty(), "there is no map yet");
     let stem = format!("{}-v{}", file_stem(&robot), map.version());
