@@ -79,3 +79,19 @@ pub(super) fn ensure_figures(
     let possible = |figure: f64| figure.abs() <= LARGEST;
     if figures.all(possible) { Ok(()) } else { Err(StateError::OutOfRange(what)) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pose_that_no_robot_has_is_none() {
+        let check = |x, theta| ensure_poses([Pose2::new(x, 0.0, theta)].into_iter(), "the pose");
+        assert_eq!(check(-1e7, 7.0), Ok(()));
+        let refused = Err(StateError::OutOfRange("the pose"));
+        // An angle that is wrapped by turns may overflow.
+        for (x, theta) in [(0.0, 1e306), (0.0, f64::NAN), (1e9, 0.0), (f64::INFINITY, 0.0)] {
+            assert_eq!(check(x, theta), refused, "{x} {theta}");
+        }
+    }
+}
