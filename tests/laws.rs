@@ -255,8 +255,9 @@ proptest! {
     }
 }
 
-/// The triangles that two neighbouring beams know to be free, in cells of a metre: as long as the
-/// shorter of the two. A full turn has one between its last beam and its first.
+/// The triangles that beams know to be free, in cells of a metre: between two neighbours, as long as
+/// the shorter of the two, and around a beam without neighbours, as wide as beams are apart. A full
+/// turn has one between its last beam and its first.
 fn wedges(scan: &ScanOutline, pose: Pose2) -> Vec<[Point2; 3]> {
     let count = scan.ends.len();
     let closes = (count as f64 + 0.5) * scan.angle_increment >= std::f64::consts::TAU;
@@ -267,18 +268,25 @@ fn wedges(scan: &ScanOutline, pose: Pose2) -> Vec<[Point2; 3]> {
         let [x, y] = scan.ends[i].point.map(f64::from);
         Point2::new(x - sensor.x, y - sensor.y)
     };
-    pairs
-        .filter(|(a, b)| scan.angle_increment <= 0.6 && says(a) && says(b))
-        .map(|(a, b)| {
-            let arms = [arm(a), arm(b)];
-            let reach = arms[0].norm().min(arms[1].norm());
-            let [a, b] = arms.map(|arm| {
-                let share = reach / arm.norm();
-                Point2::new(sensor.x + share * arm.x, sensor.y + share * arm.y)
-            });
-            [sensor, a, b].map(|corner| pose * corner)
-        })
-        .collect()
+    let pairs: Vec<(usize, usize)> =
+        pairs.filter(|(a, b)| scan.angle_increment <= 0.6 && says(a) && says(b)).collect();
+    let alone = (0..count).filter(says).filter(|i| pairs.iter().all(|(a, b)| i != a && i != b));
+    let half_width = 0.5 * scan.angle_increment.min(0.04);
+    let around = alone.map(|i| {
+        let Point2 { x, y } = arm(i);
+        let beside = |turn: f64| Point2::new(sensor.x + x - turn * y, sensor.y + y + turn * x);
+        [sensor, beside(-half_width), beside(half_width)].map(|corner| pose * corner)
+    });
+    let between = pairs.iter().map(|&(a, b)| {
+        let arms = [arm(a), arm(b)];
+        let reach = arms[0].norm().min(arms[1].norm());
+        let [a, b] = arms.map(|arm| {
+            let share = reach / arm.norm();
+            Point2::new(sensor.x + share * arm.x, sensor.y + share * arm.y)
+        });
+        [sensor, a, b].map(|corner| pose * corner)
+    });
+    between.chain(around).collect()
 }
 
 /// Whether a point is inside of the triangles: more turn left around it than right, or fewer, for

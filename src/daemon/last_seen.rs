@@ -80,9 +80,10 @@ mod tests {
     #[test]
     fn what_a_scan_sees_was_seen_then_and_the_rest_before() {
         let mut map = OccupancyMap::new(0.1);
+        // From right before the wall, so that no other cell is seen.
         let mut look = |x: f32| {
             let end = BeamEnd { point: [x, 0.05], kind: BeamEndKind::Hit };
-            let sensor = Point2::new(0.05, 0.05);
+            let sensor = Point2::new(f64::from(x) - 0.01, 0.05);
             let outline = ScanOutline { sensor, ends: vec![end], angle_increment: 0.05 };
             map.add(&outline, Pose2::IDENTITY);
             map.clone()

@@ -16,7 +16,7 @@ use super::weakness::Weakness;
 /// Steps at most, cells: bilinear interpolation sees no further.
 const LONGEST_STEP: f64 = 2.0;
 /// Steps below this, cells, end the search.
-const SHORTEST_STEP: f64 = 0.01;
+const SHORTEST_STEP: f64 = 0.005;
 /// Points that are looked at together.
 const LANES: usize = 4;
 /// Room for the pose to move within a window, cells of the coarsest map.
