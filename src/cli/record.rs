@@ -55,6 +55,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let robot = mesh::choose(&session, arguments.robot.as_deref()).await?;
         let keys = input_keys(&session, &robot).await?;
         let recorder = Recorder::start(&session, &robot, &keys, &arguments.output).await?;
+        // Who answers this has heard of the subscriptions, which went out before.
+        mesh::alive(&session).await?;
         eprintln!(
             "recording {} to {}; Ctrl-C ends it",
             mesh::name(&robot),
