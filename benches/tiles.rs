@@ -23,7 +23,7 @@ use gmapd::config::{Config, EngineKind};
 use gmapd::convert;
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
-use gmapd::daemon::ledger::{Entry, Ledger};
+use gmapd::daemon::ledger::Entry;
 use gmapd::daemon::links::LinksStatus;
 use gmapd::daemon::ros_node::{Convention, RosNode};
 use gmapd::daemon::serving::{AskStatus, Serving, Settings, Sources};
@@ -249,21 +249,9 @@ impl Robot {
 
 fn snapshot(version: &Arc<MapVersion>) -> Snapshot {
     Snapshot {
-        estimate: Estimate {
-            stamp: Some(version.stamp),
-            pose_in_map: Pose2::IDENTITY,
-            covariance: nalgebra::Matrix3::zeros(),
-            map_from_odom: Pose2::IDENTITY,
-            has_odometry: true,
-            particles: Arc::new([]),
-            report: None,
-        },
-        ledger: Ledger::default(),
-        milliseconds_per_scan: None,
-        resamples: 0,
-        paused: false,
-        mode: Mode::Mapping,
+        estimate: Estimate { stamp: Some(version.stamp), ..Estimate::default() },
         map: Some(version.clone()),
+        ..Snapshot::default()
     }
 }
 

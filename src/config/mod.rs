@@ -29,7 +29,7 @@ use crate::slam::hector;
 use crate::slam::known_poses::{self, MapExtent};
 use crate::slam::motion_gate::MotionGate;
 use crate::slam::odometry::{JumpGuard, JumpPolicy, MotionNoise};
-use crate::slam::outline::BeamLimits;
+use crate::slam::outline::{BeamLimits, FURTHEST_CELL};
 use crate::slam::pose::Pose2;
 use crate::slam::scan::{LaserMount, MountOrientation};
 use source::Entries;
@@ -82,7 +82,7 @@ impl Config {
                 max_range: raw.max_range,
                 max_usable_range: raw.max_usable_range,
                 free_on_no_return: raw.free_on_no_return,
-                furthest: known_poses::FURTHEST_CELL * raw.resolution,
+                furthest: FURTHEST_CELL * raw.resolution,
             },
             extent: match raw.map_of {
                 MapOf::AllScans => MapExtent::AllScans,

@@ -23,6 +23,9 @@ use crate::slam::pose::{Point2, Pose2, Stamp};
 /// What the YAML of a query calls the image; who saves it under another name edits one line.
 const USUAL_IMAGE: &str = "map.pgm";
 
+/// The newest poses of the path that are all published; of the older ones no more are. 155 kB.
+const PUBLISHED_POSES: usize = 1024;
+
 /// What a map is before there is one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EmptyMap {
@@ -277,6 +280,13 @@ impl MapProducts {
             evaluation::tum(&poses).into()
         };
         self.tum.get_or_init(encode).clone()
+    }
+
+    /// The path as it is published: what it costs does not grow for ever.
+    #[must_use]
+    pub fn path_excerpt(&self) -> Bytes {
+        let poses: Vec<(Stamp, Pose2)> = self.path().excerpt(PUBLISHED_POSES).collect();
+        ros::cdr(&convert::path(self.header(), &poses)).into()
     }
 
     fn path_message(&self) -> ros::Path {

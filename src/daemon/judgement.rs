@@ -187,7 +187,6 @@ mod tests {
     use std::sync::Arc;
 
     use super::super::ledger::Ledger;
-    use super::super::mapper::first_snapshot;
     use super::*;
     use crate::slam::update::ScanReport;
 
@@ -209,7 +208,7 @@ mod tests {
     ) -> (State, String) {
         let key = "robot01/scan".to_owned();
         let scan = InputStatus { key, received: 7, age_s, ..InputStatus::default() };
-        let mut snapshot = first_snapshot();
+        let mut snapshot = Snapshot::default();
         let mut gauges = Gauges::default();
         let mut ledger = Ledger::default();
         for &(verdict, count) in verdicts {

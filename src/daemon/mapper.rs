@@ -146,15 +146,6 @@ struct View {
 
 impl View {
     fn new() -> Self {
-        let estimate = Estimate {
-            stamp: None,
-            pose_in_map: Pose2::IDENTITY,
-            covariance: nalgebra::Matrix3::zeros(),
-            map_from_odom: Pose2::IDENTITY,
-            has_odometry: true,
-            particles: Arc::new([]),
-            report: None,
-        };
         Self {
             ledger: Ledger::default(),
             paused: false,
@@ -162,7 +153,7 @@ impl View {
             resamples: 0,
             times: VecDeque::new(),
             milliseconds_per_scan: None,
-            estimate,
+            estimate: Estimate::default(),
             map: None,
             version: 0,
             first_epoch: 1,
@@ -184,12 +175,6 @@ impl View {
             map: self.map.clone(),
         }
     }
-}
-
-/// The snapshot before anything has come.
-#[must_use]
-pub fn first_snapshot() -> Snapshot {
-    View::new().snapshot()
 }
 
 impl Mapper {

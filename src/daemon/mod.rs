@@ -271,7 +271,7 @@ impl Daemon {
         let mailbox = Arc::new(Mailbox::new(config.raw.scan_queue));
         let gauges = Arc::new(Mutex::new(Gauges::default()));
         let links = Arc::new(Links::default());
-        let (snapshot_sender, snapshots) = watch::channel(Arc::new(mapper::first_snapshot()));
+        let (snapshot_sender, snapshots) = watch::channel(Arc::new(Snapshot::default()));
         let verdicts = broadcast::Sender::new(VERDICTS_KEPT);
         let connections = Connections {
             mailbox: Arc::clone(&mailbox),

@@ -26,7 +26,7 @@ use super::ledger::Entry;
 use super::map_updates::{LastPut, UpdatesOutput};
 use super::message_clock::MessageClock;
 use super::ros_node::{Output, RosNode, Signature};
-use super::selector::{MessageFormat, PathFormat, Topic};
+use super::selector::Topic;
 use super::serving::{AskStatus, ServingError, Settings};
 use super::snapshot::Snapshot;
 use super::tiles::TileStore;
@@ -317,7 +317,7 @@ impl Retained {
         match self {
             Self::Map => products.cdr(),
             Self::Metadata => ros::cdr(&products.metadata()).into(),
-            Self::Path => products.path_in(PathFormat::Message(MessageFormat::Cdr)),
+            Self::Path => products.path_excerpt(),
         }
     }
 

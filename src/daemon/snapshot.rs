@@ -13,8 +13,8 @@ use crate::slam::pose::{Pose2, Stamp};
 use crate::slam::update::ScanReport;
 use crate::statistics::Spread;
 
-/// What the filter knew at one moment.
-#[derive(Debug, Clone)]
+/// What the filter knew at one moment; by default, before anything has come.
+#[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     /// Where the robot is.
     pub estimate: Estimate,
@@ -52,6 +52,21 @@ pub struct Estimate {
     pub report: Option<ScanReport>,
 }
 
+/// Before anything has come; odometry is expected.
+impl Default for Estimate {
+    fn default() -> Self {
+        Self {
+            stamp: None,
+            pose_in_map: Pose2::IDENTITY,
+            covariance: Matrix3::zeros(),
+            map_from_odom: Pose2::IDENTITY,
+            has_odometry: true,
+            particles: Arc::new([]),
+            report: None,
+        }
+    }
+}
+
 fn write_poses<S: Serializer>(poses: &Arc<[Pose2]>, to: S) -> Result<S::Ok, S::Error> {
     poses[..].serialize(to)
 }
@@ -61,7 +76,7 @@ fn read_poses<'de, D: Deserializer<'de>>(from: D) -> Result<Arc<[Pose2]>, D::Err
 }
 
 /// One version of the map. A copy costs little: tiles and poses are shared.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct MapVersion {
     /// From 1; grows with every change, and with every reset by one more.
     pub version: u64,

@@ -22,9 +22,6 @@ use super::update::{
 /// Poses may jump, for whoever gives them may have found out better.
 const ANY_STEP: JumpGuard = JumpGuard { max_step: f64::INFINITY, policy: JumpPolicy::Continue };
 
-/// Beams are not used further than this many cells: what one scan enters stays bounded.
-pub const FURTHEST_CELL: f64 = 16_000.0;
-
 /// What mapping along given poses can be told.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Parameters {

@@ -4,6 +4,10 @@ use super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
 use super::pose::Point2;
 use super::scan::{Beam, LaserMount, Scan};
 
+/// Beams are not used further than this many cells: what one scan enters stays bounded, and its
+/// hits can be looked up.
+pub const FURTHEST_CELL: f64 = 16_000.0;
+
 /// Which readings are used, and how far.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BeamLimits {

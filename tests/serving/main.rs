@@ -26,7 +26,7 @@ mod tiles;
 use rig::open;
 use rig::{
     PATIENCE, ROBOT, Rig, ask, ask_all, drive, late_joiner, leave, liveliness, locator, message,
-    next, nothing,
+    next,
 };
 
 type PoseMessage = ros::PoseWithCovarianceStamped;
@@ -175,7 +175,7 @@ async fn the_pose_of_the_past_is_on_the_corrected_path() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn before_the_first_scan_there_is_an_empty_map_and_a_sentence_for_the_rest() {
-    let rig = Rig::start(nothing()).await;
+    let rig = Rig::start(Snapshot::default()).await;
     let map: ros::OccupancyGrid = rig.ask_message("map").await;
     assert_eq!((map.info.width, map.info.height, map.info.resolution), (0, 0, 0.05));
     let json = rig.ask_json("map?format=json").await;
@@ -250,7 +250,7 @@ async fn the_service_of_slam_gmapping_answers_whatever_is_sent() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn commands_reach_the_filter_and_its_answer_comes_back() {
-    let mut rig = Rig::start(nothing()).await;
+    let mut rig = Rig::start(Snapshot::default()).await;
     let commands = [
         ("reset", Command::Reset(None)),
         ("reset?x=1;y=-2.5;yaw=0.5", Command::Reset(Some(Pose2::new(1.0, -2.5, 0.5)))),
@@ -277,7 +277,7 @@ async fn commands_reach_the_filter_and_its_answer_comes_back() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_command_is_not_lost_in_silence_when_the_filter_stops() {
-    let mut rig = Rig::start(nothing()).await;
+    let mut rig = Rig::start(Snapshot::default()).await;
     let client = rig.client.clone();
     let asked = tokio::spawn(async move { ask(&client, "slam/cmd/pause").await });
     drop(rig.commands.recv().await.unwrap());
@@ -429,14 +429,7 @@ async fn a_map_that_did_not_change_is_not_published_again() {
     next(&mut paths).await;
 
     let (later, known) = (version(&drive[4]), version(first));
-    let same = MapVersion {
-        version: later.version,
-        epoch: later.epoch,
-        stamp: later.stamp,
-        occupancy: known.occupancy.clone(),
-        occupied_threshold: known.occupied_threshold,
-        path: later.path.clone(),
-    };
+    let same = MapVersion { occupancy: known.occupancy.clone(), ..later.clone() };
     rig.show(&Snapshot { map: Some(Arc::new(same)), ..first.clone() });
     let path: ros::Path = message(&next(&mut paths).await);
     assert_eq!(stamp(path.header.stamp), later.stamp, "the version was seen");
@@ -444,6 +437,22 @@ async fn a_map_that_did_not_change_is_not_published_again() {
     rig.show(changed);
     let map: ros::OccupancyGrid = message(&next(&mut maps).await);
     assert_eq!(stamp(map.header.stamp), version(changed).stamp);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_long_path_is_published_in_excerpts_and_answered_as_a_whole() {
+    let first = drive()[3].clone();
+    let pose = |i: i64| (Stamp(1_000_000_000 * i), Pose2::new(i as f64, 0.0, 0.0));
+    let long = MapVersion { path: (0..5000).map(pose).collect(), ..version(&first).clone() };
+    let rig = Rig::start(Snapshot { map: Some(Arc::new(long)), ..first }).await;
+    let mut paths = rig.subscribe("path").await;
+    let published: ros::Path = message(&next(&mut paths).await);
+    let xs: Vec<f64> = published.poses.iter().map(|pose| pose.pose.position.x).collect();
+    assert!(xs.len() <= 2048, "{}", xs.len());
+    assert_eq!((xs[0], xs[1]), (0.0, 4.0));
+    assert!(xs.ends_with(&[4997.0, 4998.0, 4999.0]));
+    let whole: ros::Path = rig.ask_both("path").await;
+    assert_eq!(whole.poses.len(), 5000);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -479,7 +488,7 @@ async fn maps_keep_their_distance_and_who_comes_anew_does_not_wait() {
 #[tokio::test(flavor = "multi_thread")]
 async fn poses_particles_and_entropy_come_with_each_scan() {
     let drive = drive();
-    let rig = Rig::start(nothing()).await;
+    let rig = Rig::start(Snapshot::default()).await;
     let mut poses = rig.subscribe("pose").await;
     let mut clouds = rig.subscribe("particlecloud").await;
     let mut entropies = rig.subscribe("entropy").await;
@@ -522,7 +531,7 @@ async fn map_to_odom_is_sent_in_the_time_of_the_messages_and_goes_on() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn diagnostics_tell_the_state() {
-    let rig = Rig::start(nothing()).await;
+    let rig = Rig::start(Snapshot::default()).await;
     let mut diagnostics = rig.subscribe("diagnostics").await;
     let message: ros::DiagnosticArray = message(&next(&mut diagnostics).await);
     let status = &message.status[0];
@@ -535,7 +544,7 @@ async fn diagnostics_tell_the_state() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_newest_verdict_arrives_however_many_there_are() {
-    let rig = Rig::start(nothing()).await;
+    let rig = Rig::start(Snapshot::default()).await;
     let mut verdicts = rig.subscribe("slam/verdict").await;
     for number in 1..=500 {
         let entry = Entry {

@@ -8,7 +8,7 @@ use std::time::Duration;
 use gmapd::config::{Config, EngineKind};
 use gmapd::daemon::command::Request;
 use gmapd::daemon::keys::Prefix;
-use gmapd::daemon::ledger::{Entry, Ledger};
+use gmapd::daemon::ledger::Entry;
 use gmapd::daemon::limits::Limits;
 use gmapd::daemon::links::LinksStatus;
 use gmapd::daemon::ros_node::{Convention, RosNode};
@@ -84,28 +84,7 @@ fn snapshot(filter: &GMapping, report: ScanReport, version: MapVersion) -> Snaps
         particles: vec![filter.pose_in_map(); filter.particles().len()].into(),
         report: Some(report),
     };
-    Snapshot { estimate, map: Some(Arc::new(version)), ..nothing() }
-}
-
-/// Before the first message.
-pub(crate) fn nothing() -> Snapshot {
-    Snapshot {
-        estimate: Estimate {
-            stamp: None,
-            pose_in_map: Pose2::IDENTITY,
-            covariance: nalgebra::Matrix3::zeros(),
-            map_from_odom: Pose2::IDENTITY,
-            has_odometry: true,
-            particles: Arc::new([]),
-            report: None,
-        },
-        ledger: Ledger::default(),
-        milliseconds_per_scan: None,
-        resamples: 0,
-        paused: false,
-        mode: Mode::Mapping,
-        map: None,
-    }
+    Snapshot { estimate, map: Some(Arc::new(version)), ..Snapshot::default() }
 }
 
 fn status() -> Status {

@@ -80,26 +80,19 @@ async fn a_mirror_has_every_version_as_a_whole() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_reset_empties_the_mirror_and_a_new_map_fills_it() {
     let drive = drive();
-    let rig = Rig::start(nothing()).await;
+    let rig = Rig::start(Snapshot::default()).await;
     let mirror = follow(&rig.client).await;
     until(&mirror, |state| state.is_newest).await;
     assert!(mirror.map().grid().cells.is_empty());
     rig.show(&drive[5]);
     let state = until(&mirror, has(&drive[5])).await;
     assert_eq!(state.map.epoch(), 1);
-    rig.show(&nothing());
+    rig.show(&Snapshot::default());
     let state = until(&mirror, |state| state.map.epoch() == 2).await;
     assert_eq!((state.map.tiles(), state.map.grid().cells.len()), (0, 0));
 
     let known = version(&drive[0]);
-    let anew = MapVersion {
-        version: known.version + 100,
-        epoch: 2,
-        stamp: known.stamp,
-        occupancy: known.occupancy.clone(),
-        occupied_threshold: known.occupied_threshold,
-        path: known.path.clone(),
-    };
+    let anew = MapVersion { version: known.version + 100, epoch: 2, ..known.clone() };
     let anew = Snapshot { map: Some(Arc::new(anew)), ..drive[0].clone() };
     rig.show(&anew);
     let state = until(&mirror, has(&anew)).await;
@@ -276,14 +269,7 @@ async fn after_thirty_percent_were_lost_mirrors_are_right_within_a_digest_period
 /// The maps of a drive again and again, as versions of their own.
 fn numbered((number, snapshot): (usize, &Snapshot)) -> Snapshot {
     let map = version(snapshot);
-    let map = MapVersion {
-        version: number as u64 + 2,
-        epoch: map.epoch,
-        stamp: map.stamp,
-        occupancy: map.occupancy.clone(),
-        occupied_threshold: map.occupied_threshold,
-        path: map.path.clone(),
-    };
+    let map = MapVersion { version: number as u64 + 2, ..map.clone() };
     Snapshot { map: Some(Arc::new(map)), ..snapshot.clone() }
 }
 

@@ -2,13 +2,11 @@
 
 use super::super::grid::likelihood_field::Points;
 use super::super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
-use super::super::outline::{BeamLimits, outline};
+use super::super::outline::{BeamLimits, FURTHEST_CELL, outline};
 use super::{Parameters, ScanReading};
 
 /// Of the hits, the climb looks at every second.
 const COARSE_STEP: usize = 2;
-/// Hits further away than this cannot be looked up, cells.
-const MAX_RADIUS: f64 = 16_000.0;
 /// Neighbouring hits lie on one surface if they are at most this far apart, m, ...
 const SURFACE_GAP: f64 = 2.0;
 /// ... and at most this many times as far as on a surface seen head-on.
@@ -42,7 +40,7 @@ impl PreparedScan {
             max_range: parameters.max_range,
             max_usable_range: parameters.max_usable_range,
             free_on_no_return: parameters.map.free_on_no_return,
-            furthest: MAX_RADIUS * parameters.resolution,
+            furthest: FURTHEST_CELL * parameters.resolution,
         };
         let outline = outline(reading.scan, reading.mount, &limits);
         let resolution = parameters.resolution;

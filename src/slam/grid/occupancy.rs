@@ -200,7 +200,8 @@ impl OccupancyMap {
     }
 
     /// The lower-left and the upper-right of the cells that were seen; `None` if there are none.
-    fn bounds(&self) -> Option<(Cell, Cell)> {
+    #[must_use]
+    pub fn bounds(&self) -> Option<(Cell, Cell)> {
         let mut bounds: Option<(Cell, Cell)> = None;
         let size = TILE_SIZE as i32;
         for (key, tile) in self.counts.tiles() {

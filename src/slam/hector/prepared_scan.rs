@@ -2,7 +2,7 @@
 
 use super::super::deskew::Velocity;
 use super::super::grid::occupancy::{BeamEnd, BeamEndKind, ScanOutline};
-use super::super::known_poses::FURTHEST_CELL;
+use super::super::outline::FURTHEST_CELL;
 use super::super::pose::Point2;
 use super::super::scan::{Beam, LaserMount, Scan, ScanGeometry};
 use super::Parameters;
