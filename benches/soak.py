@@ -6,7 +6,7 @@
 Needs eclipse-zenoh. Plays laps of one building at many times real time to a daemon that keeps its
 state and records. At each look at it something is done to it as well: messages that are none,
 queries and commands, clients that come and go, and a network that is cut while the robot stands.
-Each look is a row: memory, open files, what a scan takes, how many links ended.
+Each look is a row: memory since the last one, open files, what a scan takes, how many links ended.
 
 After the first tenth all should stay as it is. What is judged are the medians of whole cycles of
 these four doings, by a line through them (the median of all slopes between two cycles): memory may
@@ -96,11 +96,31 @@ def session(mode, **endpoints):
     return zenoh.open(config)
 
 
-def memory(pid):
-    """What a process has in memory, MB: all of it, and what is not pages of its program file."""
-    lines = pathlib.Path(f"/proc/{pid}/status").read_text().splitlines()
-    kib = dict(line.split()[:2] for line in lines if line.startswith(("VmRSS", "RssAnon")))
-    return [round(int(kib[of]) * 1024 / 1e6, 1) for of in ("VmRSS:", "RssAnon:")]
+class Memory(threading.Thread):
+    """Looks ten times a second at what a process has in memory, without its program file's pages:
+    with each scan, map and checkpoint it goes up and down by a third."""
+
+    def __init__(self, pid):
+        super().__init__(daemon=True)
+        self.status, self.megabytes, self.lock = pathlib.Path(f"/proc/{pid}/status"), [], threading.Lock()
+        self.start()
+
+    def run(self):
+        try:
+            while True:
+                lines = self.status.read_text().splitlines()
+                kib = next((line.split()[1] for line in lines if line.startswith("RssAnon:")), 0)
+                with self.lock:
+                    self.megabytes.append(int(kib) * 1024 / 1e6)
+                time.sleep(0.1)
+        except OSError:
+            pass
+
+    def take(self):
+        """Median and maximum since the last time."""
+        with self.lock:
+            taken, self.megabytes = self.megabytes, []
+        return round(statistics.median(taken), 2), round(max(taken), 1)
 
 
 def cpu_seconds(pid):
@@ -167,14 +187,14 @@ class Faults:
         self.player.send_signal(signal.SIGCONT)
 
 
-def row(process, status, driven, doing):
+def row(process, memory, status, driven, doing):
     scan = status["milliseconds_per_scan"] or {}
-    resident, anonymous = memory(process.pid)
+    median, most = memory.take()
     return {
         "driven_s": round(driven, 1),
         "after": doing,
-        "resident_mb": resident,
-        "anonymous_mb": anonymous,
+        "anonymous_mb": median,
+        "most_anonymous_mb": most,
         "open_files": len(list(pathlib.Path(f"/proc/{process.pid}/fd").iterdir())),
         "ms_p50": scan.get("p50"),
         "ms_p99": scan.get("p99"),
@@ -213,6 +233,7 @@ def soak(options, directory):
     router = session("router", listen=endpoint)
     client, wire = session("client", connect=endpoint), Wire(port)
     drive, daemon = Drive(client), daemon_of(options, directory, wire.endpoint)
+    memory = Memory(daemon.pid)
     status_of(client)
     play = [str(options.gmapd.resolve()), "play", log, "--prefix", "soak", "--rate", str(options.rate)]
     player = subprocess.Popen([*play, "-e", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -223,7 +244,7 @@ def soak(options, directory):
         time.sleep(step)
         doing = next(doings)
         doing(client)
-        rows.append(row(daemon, status_of(client), drive.seconds(), doing.__name__))
+        rows.append(row(daemon, memory, status_of(client), drive.seconds(), doing.__name__))
         print(json.dumps(rows[-1]), flush=True)
     player.kill()
     daemon.terminate()

@@ -7,8 +7,9 @@
 mod store;
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::fs;
-use std::io::{self, Read as _};
+use std::io::{self, BufWriter, Read as _, Write};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -29,11 +30,14 @@ const CHECKSUM: usize = 32;
 /// Larger files are no checkpoints, and no larger body is inflated.
 const LARGEST: u64 = 1 << 31;
 
+/// So much of a body goes to the compressor at once, bytes.
+const PIECE: usize = 1 << 16;
+
 /// Fast: the state is mostly floats, of which little can be saved.
 const COMPRESSION: i32 = 1;
 
 /// What a checkpoint is of.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Head {
     /// The version of gmapd that wrote it.
     pub gmapd: String,
@@ -174,13 +178,55 @@ pub enum Refusal {
     },
 }
 
-/// A checkpoint's bytes; the head's `body_bytes` are filled in.
+/// Where a body is written to: it is compressed as it comes, and never whole in memory.
+pub struct BodyWriter {
+    to: BufWriter<zstd::stream::write::Encoder<'static, Vec<u8>>>,
+    bytes: u64,
+}
+
+impl BodyWriter {
+    fn new() -> io::Result<Self> {
+        let encoder = zstd::stream::write::Encoder::new(Vec::new(), COMPRESSION)?;
+        Ok(Self { to: BufWriter::with_capacity(PIECE, encoder), bytes: 0 })
+    }
+
+    /// How many bytes were written, and those compressed.
+    fn finish(self) -> io::Result<(u64, Vec<u8>)> {
+        Ok((self.bytes, self.to.into_inner()?.finish()?))
+    }
+}
+
+impl fmt::Debug for BodyWriter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("BodyWriter").field("bytes", &self.bytes).finish_non_exhaustive()
+    }
+}
+
+impl Write for BodyWriter {
+    #[inline]
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.to.write(bytes)?;
+        self.bytes += written as u64;
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.to.flush()
+    }
+}
+
+/// A checkpoint's bytes, with the body that `write` writes; the head's `body_bytes` are filled in.
 ///
 /// # Errors
-/// When the compressor fails, which only a lack of memory makes it do.
-pub fn seal(head: Head, body: &[u8]) -> io::Result<Vec<u8>> {
-    let head = serde_json::to_vec(&Head { body_bytes: body.len() as u64, ..head })?;
-    let body = zstd::bulk::compress(body, COMPRESSION)?;
+/// When `write` fails, or the compressor does, which only a lack of memory makes it do.
+pub fn seal(
+    head: Head,
+    write: impl FnOnce(&mut BodyWriter) -> io::Result<()>,
+) -> io::Result<Vec<u8>> {
+    let mut body = BodyWriter::new()?;
+    write(&mut body)?;
+    let (body_bytes, body) = body.finish()?;
+    let head = serde_json::to_vec(&Head { body_bytes, ..head })?;
     let mut bytes = Vec::with_capacity(FIXED + head.len() + body.len() + CHECKSUM);
     bytes.extend(MAGIC);
     bytes.extend(FORMAT.to_le_bytes());
@@ -291,10 +337,14 @@ mod tests {
         }
     }
 
+    fn sealed(body: &[u8]) -> Vec<u8> {
+        seal(head(), |to| to.write_all(body)).unwrap()
+    }
+
     proptest! {
         #[test]
         fn what_is_sealed_is_found_again(body in vec(any::<u8>(), 0..3000)) {
-            let sealed = seal(head(), &body).unwrap();
+            let sealed = sealed(&body);
             let opened = open(&sealed).unwrap();
             prop_assert_eq!(opened.head, Head { body_bytes: body.len() as u64, ..head() });
             prop_assert_eq!(open(&sealed).unwrap().body().unwrap(), body);
@@ -303,7 +353,7 @@ mod tests {
 
     #[test]
     fn cut_anywhere_and_with_any_bit_flipped_it_is_refused() {
-        let sealed = seal(head(), &[7; 300]).unwrap();
+        let sealed = sealed(&[7; 300]);
         for length in 0..sealed.len() {
             let refusal = open(&sealed[..length]).unwrap_err();
             let expected = matches!(refusal, Refusal::Length { found, .. } if found == length as u64)
@@ -327,7 +377,7 @@ mod tests {
 
     /// Its checksum fits, but somebody else wrote it.
     fn forged(change: impl Fn(&mut Vec<u8>)) -> Vec<u8> {
-        let mut bytes = seal(head(), &[7; 300]).unwrap();
+        let mut bytes = sealed(&[7; 300]);
         bytes.truncate(bytes.len() - CHECKSUM);
         change(&mut bytes);
         let checksum = Sha256::digest(&bytes);
@@ -340,7 +390,7 @@ mod tests {
         let newer = forged(|bytes| bytes[12] += 1);
         let refusal = open(&newer).unwrap_err().to_string();
         assert_eq!(refusal, "it has format version 3, and this gmapd reads 2");
-        let other = seal(head(), &[7; 300]).unwrap();
+        let other = sealed(&[7; 300]);
         for told in [299_u64, 301, 1 << 40] {
             let mut opened = open(&other).unwrap();
             opened.head.body_bytes = told;

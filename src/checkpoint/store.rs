@@ -134,6 +134,8 @@ pub fn checkpoints(directory: &Path) -> Vec<(u64, PathBuf)> {
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write as _;
+
     use super::super::seal;
     use super::super::tests::head;
     use super::*;
@@ -146,7 +148,7 @@ mod tests {
     fn the_last_good_ones_are_kept_and_nothing_else_is_touched() {
         let directory = tempfile::tempdir().unwrap();
         let directory = directory.path().join("deep").join("state");
-        let good = seal(head(), b"state").unwrap();
+        let good = seal(head(), |to| to.write_all(b"state")).unwrap();
         let mut store = Store::new(&directory, 3).unwrap();
         (0..5).for_each(|_| drop(store.write(&good).unwrap()));
         assert_eq!(numbers(&directory), [5, 4, 3]);
@@ -155,7 +157,7 @@ mod tests {
             [6, 7].map(|n| directory.join(format!("checkpoint-{n:010}.state")));
         fs::write(&damaged, &good[..40]).unwrap();
         let other = Head { robot: "robot02".to_owned(), ..head() };
-        fs::write(&foreign, seal(other, b"state").unwrap()).unwrap();
+        fs::write(&foreign, seal(other, |to| to.write_all(b"state")).unwrap()).unwrap();
         fs::write(directory.join(".checkpoint-0000000008.state.77.tmp"), b"half").unwrap();
         fs::write(directory.join("notes.txt"), b"mine").unwrap();
 
@@ -183,7 +185,7 @@ mod tests {
     #[test]
     fn what_cannot_be_written_is_told_and_deletes_nothing() {
         let directory = tempfile::tempdir().unwrap();
-        let good = seal(head(), b"state").unwrap();
+        let good = seal(head(), |to| to.write_all(b"state")).unwrap();
         let mut store = Store::new(directory.path(), 1).unwrap();
         store.write(&good).unwrap();
         // A directory that nobody empties has the name that is next.

@@ -1,5 +1,6 @@
 //! The state on disk: when it is written, on a thread of its own, and which one is gone on from.
 
+use std::io::{self, Write};
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -38,12 +39,12 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// Its bytes.
+    /// Writes its bytes.
     ///
     /// # Errors
-    /// When memory does not take them.
-    pub fn encode(&self) -> Result<Vec<u8>, postcard::Error> {
-        postcard::to_stdvec(self)
+    /// When they cannot be written.
+    pub fn write(&self, to: &mut impl Write) -> io::Result<()> {
+        postcard::to_io(self, to).map(|_| ()).map_err(io::Error::other)
     }
 
     /// Of the body of a checkpoint.
@@ -126,9 +127,7 @@ pub enum CheckpointsError {
 #[derive(Debug, Error)]
 enum NotWritten {
     #[error("the state cannot be encoded: {0}")]
-    Encode(#[from] postcard::Error),
-    #[error("the state cannot be compressed: {0}")]
-    Seal(std::io::Error),
+    Encode(io::Error),
     #[error("{error}: {}", error.source)]
     Write {
         #[from]
@@ -302,13 +301,7 @@ fn own_head(config: &Config, prefix: &Prefix) -> Head {
         robot: prefix.to_string(),
         engine: engine.to_owned(),
         settings: config.settings_of_state(),
-        scans: 0,
-        processed: 0,
-        particles: 0,
-        stamp: None,
-        map: None,
-        searching: false,
-        body_bytes: 0,
+        ..Head::default()
     }
 }
 
@@ -394,8 +387,9 @@ impl Writer {
         let watch = Stopwatch::start();
         let (stamp, scans) = (mapper.taken(), mapper.scans());
         let (head, state) = self.describe(engine, &mapper);
-        let body = Checkpoint { engine: state, mapper }.encode()?;
-        let sealed = checkpoint::seal(head, &body).map_err(NotWritten::Seal)?;
+        let checkpoint = Checkpoint { engine: state, mapper };
+        let sealed =
+            checkpoint::seal(head, |to| checkpoint.write(to)).map_err(NotWritten::Encode)?;
         let path = self.store.write(&sealed)?;
         Ok(WrittenCheckpoint {
             file: name(&path.display().to_string()),
@@ -407,10 +401,11 @@ impl Writer {
     }
 
     fn describe(&self, mut engine: Engine, mapper: &MapperState) -> (Head, EngineState) {
-        let map = engine.occupancy_grid().map(|grid| MapSize {
-            width: grid.width,
-            height: grid.height,
-            resolution: grid.resolution,
+        let occupancy = engine.occupancy();
+        let map = occupancy.bounds().map(|(low, high)| MapSize {
+            width: (high.ix - low.ix + 1) as usize,
+            height: (high.iy - low.iy + 1) as usize,
+            resolution: occupancy.resolution(),
         });
         let head = Head {
             scans: mapper.scans(),
