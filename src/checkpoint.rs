@@ -218,7 +218,8 @@ impl Write for BodyWriter {
 /// A checkpoint's bytes, with the body that `write` writes; the head's `body_bytes` are filled in.
 ///
 /// # Errors
-/// When `write` fails, or the compressor does, which only a lack of memory makes it do.
+/// When `write` fails, or the compressor does, which only a lack of memory makes it do, or nobody
+/// would read what is so large.
 pub fn seal(
     head: Head,
     write: impl FnOnce(&mut BodyWriter) -> io::Result<()>,
@@ -226,6 +227,9 @@ pub fn seal(
     let mut body = BodyWriter::new()?;
     write(&mut body)?;
     let (body_bytes, body) = body.finish()?;
+    if body_bytes.max(body.len() as u64) > LARGEST / 2 {
+        return Err(io::Error::other(format!("a state of {body_bytes} bytes is too large")));
+    }
     let head = serde_json::to_vec(&Head { body_bytes, ..head })?;
     let mut bytes = Vec::with_capacity(FIXED + head.len() + body.len() + CHECKSUM);
     bytes.extend(MAGIC);
@@ -244,7 +248,11 @@ pub fn seal(
 /// # Errors
 /// When there is no such file, or one that is far too large.
 pub fn read(path: &Path) -> Result<Vec<u8>, Refusal> {
-    let length = fs::metadata(path)?.len();
+    let metadata = fs::metadata(path)?;
+    if !metadata.is_file() {
+        return Err(Refusal::Foreign);
+    }
+    let length = metadata.len();
     if length > LARGEST {
         return Err(Refusal::Read(io::Error::other(format!("{length} bytes are too many"))));
     }

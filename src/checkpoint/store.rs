@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 use std::fs::{self, File, TryLockError};
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
@@ -22,8 +24,8 @@ pub struct Store {
     /// Numbers of those that are known to be good, oldest first.
     good: VecDeque<u64>,
     next: u64,
-    /// Nobody else writes here as long as it is open.
-    _lock: Option<File>,
+    /// Nobody else writes here as long as it is open; `None` until there is one.
+    lock: Option<File>,
 }
 
 /// Why a directory cannot be used.
@@ -43,15 +45,45 @@ impl Store {
     /// When another daemon uses it.
     pub fn new(directory: &Path, keep: usize) -> Result<Self, StoreError> {
         fs::create_dir_all(directory).ok();
-        let lock = File::options().create(true).append(true).open(directory.join(LOCK)).ok();
-        if let Some(Err(TryLockError::WouldBlock)) = lock.as_ref().map(File::try_lock) {
-            return Err(StoreError::Locked(directory.to_owned()));
-        }
-        let next = checkpoints(directory).first().map_or(1, |(number, _)| number + 1);
+        let lock = match lock(directory) {
+            Err(TryLockError::WouldBlock) => return Err(StoreError::Locked(directory.to_owned())),
+            lock => lock.ok(),
+        };
         let directory = directory.to_owned();
-        let store = Self { directory, keep, good: VecDeque::new(), next, _lock: lock };
+        let store = Self { directory, keep, good: VecDeque::new(), next: 1, lock };
         store.remove_unfinished();
         Ok(store)
+    }
+
+    /// Sees to it that there is a directory of ours, without a file of this name.
+    fn prepare(&mut self, path: &Path) -> io::Result<()> {
+        fs::create_dir_all(&self.directory)?;
+        self.hold_lock()?;
+        if path.try_exists()? {
+            return Err(io::ErrorKind::AlreadyExists.into());
+        }
+        Ok(())
+    }
+
+    /// The directory may have come only now, or be another than it was: a disk that is mounted late
+    /// has checkpoints, and may have a daemon.
+    fn hold_lock(&mut self) -> io::Result<()> {
+        let is = |held: &File, found: &fs::Metadata| {
+            held.metadata().is_ok_and(|held| (held.dev(), held.ino()) == (found.dev(), found.ino()))
+        };
+        let found = fs::metadata(self.directory.join(LOCK)).ok();
+        if self.lock.as_ref().zip(found).is_some_and(|(held, found)| is(held, &found)) {
+            return Ok(());
+        }
+        self.lock = match lock(&self.directory) {
+            Ok(lock) => Some(lock),
+            Err(TryLockError::WouldBlock) => {
+                return Err(io::Error::other(StoreError::Locked(self.directory.clone())));
+            }
+            // Where there are no locks, one goes on without.
+            Err(TryLockError::Error(_)) => None,
+        };
+        Ok(())
     }
 
     /// Where it is.
@@ -81,7 +113,7 @@ impl Store {
         let mut found: Vec<u64> = checkpoints(&self.directory)
             .into_iter()
             .filter_map(|(number, path)| good(&path).ok().map(|()| number))
-            .filter(|number| *number < self.next && !self.good.contains(number))
+            .filter(|number| !self.good.contains(number))
             .collect();
         found.extend(self.good.drain(..));
         found.sort_unstable();
@@ -94,11 +126,12 @@ impl Store {
     /// When the directory cannot be made or written to, or the disk is full; nothing is deleted
     /// then.
     pub fn write(&mut self, bytes: &[u8]) -> Result<PathBuf, WriteError> {
-        let number = self.next;
+        let newest = checkpoints(&self.directory).first().map_or(0, |(number, _)| *number);
+        let number = self.next.max(newest.saturating_add(1));
         // A file that has its name already may fail to be synced: the next is another in any case.
-        self.next += 1;
+        self.next = number.saturating_add(1);
         let path = self.path(number);
-        if let Err(source) = fs::create_dir_all(&self.directory) {
+        if let Err(source) = self.prepare(&path) {
             return Err(WriteError { path, source });
         }
         write_atomically(&path, bytes)?;
@@ -114,6 +147,14 @@ impl Store {
     fn path(&self, number: u64) -> PathBuf {
         self.directory.join(format!("{BEGINNING}{number:010}{ENDING}"))
     }
+}
+
+/// The lock of a directory, held.
+fn lock(directory: &Path) -> Result<File, TryLockError> {
+    let lock = File::options().create(true).append(true).open(directory.join(LOCK));
+    let lock = lock.map_err(TryLockError::Error)?;
+    lock.try_lock()?;
+    Ok(lock)
 }
 
 /// The checkpoints of a directory, newest first, by their numbers.
@@ -135,6 +176,7 @@ pub fn checkpoints(directory: &Path) -> Vec<(u64, PathBuf)> {
 #[cfg(test)]
 mod tests {
     use std::io::Write as _;
+    use std::os::unix::fs::symlink;
 
     use super::super::seal;
     use super::super::tests::head;
@@ -188,13 +230,37 @@ mod tests {
         let good = seal(head(), |to| to.write_all(b"state")).unwrap();
         let mut store = Store::new(directory.path(), 1).unwrap();
         store.write(&good).unwrap();
-        // A directory that nobody empties has the name that is next.
-        fs::create_dir_all(directory.path().join("checkpoint-0000000002.state/in it")).unwrap();
+        // No number is left.
+        let last = directory.path().join(format!("checkpoint-{}.state", u64::MAX));
+        fs::write(&last, "mine").unwrap();
         let error = store.write(&good).unwrap_err();
-        assert!(error.to_string().ends_with("checkpoint-0000000002.state"), "{error}");
-        assert_eq!(numbers(directory.path()), [2, 1]);
+        assert!(error.to_string().ends_with(&*last.to_string_lossy()), "{error}");
+        assert_eq!(numbers(directory.path()), [u64::MAX, 1]);
+        assert_eq!(fs::read(&last).unwrap(), b"mine");
         assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 3);
-        assert!(store.write(&good).unwrap().ends_with("checkpoint-0000000003.state"));
-        assert_eq!(numbers(directory.path()), [3, 2], "the good one before is replaced");
+        fs::remove_file(&last).unwrap();
+        store.write(&good).unwrap();
+        assert_eq!(numbers(directory.path()), [u64::MAX], "the good one before is replaced");
+    }
+
+    #[test]
+    fn a_directory_that_comes_late_is_locked_and_nothing_in_it_is_overwritten() {
+        let root = tempfile::tempdir().unwrap();
+        let [place, disk] = ["state", "disk"].map(|name| root.path().join(name));
+        let good = seal(head(), |to| to.write_all(b"state")).unwrap();
+        symlink(root.path().join("not mounted/yet"), &place).unwrap();
+        let mut store = Store::new(&place, 3).unwrap();
+        store.write(&good).unwrap_err();
+
+        let other = Store::new(&disk, 3).unwrap();
+        fs::write(disk.join("checkpoint-0000000018.state"), &good).unwrap();
+        fs::remove_file(&place).unwrap();
+        symlink(&disk, &place).unwrap();
+        let error = store.write(&good).unwrap_err().source.to_string();
+        assert!(error.starts_with("another daemon"), "{error}");
+        drop(other);
+        assert!(store.write(&good).unwrap().ends_with("checkpoint-0000000020.state"));
+        assert_eq!(numbers(&disk), [20, 18]);
+        Store::new(&disk, 3).unwrap_err();
     }
 }

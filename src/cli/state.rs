@@ -1,5 +1,6 @@
 //! `gmapd state`: what is in the checkpoints of a daemon.
 
+use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
@@ -46,7 +47,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } else {
         vec![path.clone()]
     };
-    let found: Vec<Found> = paths.iter().map(|path| look(path)).collect();
+    // A daemon that runs may have deleted one since they were listed.
+    let is_gone = |found: &Found| {
+        path.is_dir()
+            && matches!(&found.wrong, Some(Refusal::Read(error)) if error.kind() == NotFound)
+    };
+    let found = paths.iter().map(|path| look(path)).filter(|found| !is_gone(found));
+    let found: Vec<Found> = found.collect();
     if *json {
         println!("{:#}", Value::from_iter(found.iter().map(Found::json)));
     } else {
