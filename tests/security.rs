@@ -15,10 +15,15 @@ use gmapd::daemon::keys::Prefix;
 use gmapd::daemon::limits::Reason;
 use gmapd::daemon::snapshot::State;
 use gmapd::daemon::{Daemon, Settings};
+use processes::text;
 use tokio::sync::watch;
 use tracing_subscriber::EnvFilter;
+use zenoh::qos::CongestionControl;
 use zenoh::query::Query;
 use zenoh::{Session, Wait as _};
+
+#[expect(dead_code, reason = "other tests use the rest")]
+mod processes;
 
 /// How long anything may take on a machine that does other things as well.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -92,7 +97,7 @@ async fn router(configuration: &str) -> (Session, String) {
     let router = zenoh::open(zenoh::Config::from_json5(configuration).unwrap()).await.unwrap();
     let locator = router.info().locators().await[0].to_string();
     let port = locator.rsplit(':').next().unwrap();
-    let locator = format!("tls/localhost:{port}");
+    let locator = format!("quic/localhost:{port}");
     (router, locator)
 }
 
@@ -107,7 +112,7 @@ impl Mesh {
         let users = secure().join("password/users.txt");
         std::fs::copy(users, directory.path().join("users.txt")).unwrap();
         let text = configuration(directory.path(), kind, "router.json5");
-        let text = text.replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
+        let text = text.replace("quic/0.0.0.0:7447", "quic/127.0.0.1:0");
         let (router, locator) = router(&text).await;
         Self { log, directory, kind, router, locator }
     }
@@ -115,14 +120,14 @@ impl Mesh {
     /// Another router, with somebody's certificate.
     async fn router_with(&self, certificate: &str) -> (Session, String) {
         let text = configuration(self.directory.path(), self.kind, "router.json5");
-        let text = text.replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
+        let text = text.replace("quic/0.0.0.0:7447", "quic/127.0.0.1:0");
         router(&text.replace("certificates/router", certificate)).await
     }
 
     /// How `who` connects; a stranger is refused at once.
     fn configuration(&self, who: &str) -> String {
         configuration(self.directory.path(), self.kind, &format!("{who}.json5"))
-            .replace("tls/localhost:7447", &self.locator)
+            .replace("quic/localhost:7447", &self.locator)
             .replace("timeout_ms: -1", "timeout_ms: 0")
     }
 
@@ -171,6 +176,7 @@ impl Mesh {
         assert!(maps.len() == 1 && maps[0].contains("resolution"), "{maps:?}");
         impostor.undeclare().await.unwrap();
 
+        self.only_its_own_topics_are_told(&robot, &base).await;
         self.another_robot_is_out_of_reach(&robot).await;
         self.who_looks_is_served(&reader).await;
 
@@ -215,6 +221,17 @@ impl OtherRobot {
 }
 
 impl Mesh {
+    /// To bridges to ROS 2, which nonsense may end.
+    async fn only_its_own_topics_are_told(&self, robot: &Session, base: &Session) {
+        let tokens = base.liveliness().declare_subscriber("@/aa/@ros2_lv/**").await.unwrap();
+        let told = ["AB", "MP/robot02§scan/type/::", "MP/robot01§scan/type/::"];
+        for token in told.map(|token| format!("@/aa/@ros2_lv/{token}")) {
+            robot.liveliness().declare_token(token).await.unwrap().undeclare().await.unwrap();
+        }
+        let heard = tokio::time::timeout(PATIENCE, tokens.recv_async()).await.unwrap().unwrap();
+        assert_eq!(heard.key_expr().as_str(), "@/aa/@ros2_lv/MP/robot01§scan/type/::");
+    }
+
     async fn another_robot_is_out_of_reach(&self, robot: &Session) {
         let other = OtherRobot::on(&self.router).await;
         for key in ["scan", "odom", "tf", "tf_static", "slam/cmd/pause"] {
@@ -316,6 +333,56 @@ async fn with_certificates_each_does_what_is_theirs_and_strangers_stay_outside()
     mesh.refuses(&mesh.configuration("base").replace(&mesh.locator, &router.1)).await;
     router.0.close().await.unwrap();
     mesh.keeps_each_to_what_is_theirs().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drive_through_the_router_gives_the_map_that_replaying_it_gives() {
+    let mesh = Mesh::start("").await;
+    let file = mesh.directory.path().join("drive.json5");
+    std::fs::write(&file, mesh.configuration("robot")).unwrap();
+    let drive = move || {
+        let directory = processes::directory();
+        let log = processes::simulated_log(&directory);
+        let [map, replayed] = ["map.pgm", "replayed"].map(|name| directory.path().join(name));
+        let zenoh = ["--zenoh", text(&file)];
+        let mut run = processes::program();
+        run.args(["run", "--prefix", "robot01", "--threads", "1"]).args(zenoh);
+        let daemon = processes::Background::start(&mut run);
+        daemon.line_with("waiting for scans");
+        let play = ["play", text(&log), "--prefix", "robot01", "--rate", "max"];
+        processes::succeed(&[&play[..], &zenoh].concat());
+        let get = ["get", "robot01", "map", "-o", text(&map)];
+        processes::succeed(&[&get[..], &zenoh].concat());
+        processes::succeed(&["replay", text(&log), "--out", text(&replayed)]);
+        let [live, replayed] =
+            [map, replayed.join("map.pgm")].map(|path| std::fs::read(path).unwrap());
+        assert!(live == replayed);
+    };
+    tokio::task::spawn_blocking(drive).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_message_that_is_far_too_large_is_dropped_before_it_is_whole() {
+    let start = || processes::Daemon::start("robot01");
+    let daemon = tokio::task::spawn_blocking(start).await.unwrap();
+    let config = format!(
+        r#"{{ mode: "client", connect: {{ endpoints: ["{}"] }},
+             scouting: {{ multicast: {{ enabled: false }} }} }}"#,
+        daemon.endpoint
+    );
+    let client = zenoh::open(zenoh::Config::from_json5(&config).unwrap()).await.unwrap();
+    let scans = client.declare_publisher("robot01/scan");
+    let scans = scans.congestion_control(CongestionControl::Block).await.unwrap();
+    while !scans.matching_status().await.unwrap().matching() {
+        tokio::task::yield_now().await;
+    }
+    scans.put(vec![0_u8; 200 << 20]).await.unwrap();
+    scans.put(vec![0_u8; 5 << 20]).await.unwrap();
+    let status = ask_until_answered(&client, "robot01/slam/status").await;
+    let status: serde_json::Value = serde_json::from_str(&status[0]).unwrap();
+    let scans = &status["inputs"]["scan"];
+    assert_eq!((&scans["received"], &scans["rejected"]), (&1.into(), &1.into()), "{status}");
+    assert!(status["peak_memory_bytes"].as_u64().unwrap() < 120 << 20, "{status}");
 }
 
 #[test]

@@ -25,6 +25,13 @@ const LOG_FILTER: &str = "warn,gmapd=info";
 /// Exit code of a process that a second Ctrl-C ended, as shells count it.
 const INTERRUPTED: i32 = 130;
 
+/// Between two warnings that nobody answers.
+const WAITING: Duration = Duration::from_secs(10);
+
+/// What Zenoh takes beyond the largest message that is read, bytes: what is a little too large is
+/// told with its key.
+const ROOM: usize = 4 << 20;
+
 /// How long tasks that are left may take at the end.
 const LAST_BREATH: Duration = Duration::from_millis(100);
 
@@ -139,10 +146,12 @@ async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow:
         tracing::info!("connecting to {}", mesh.endpoints().join(", "));
     }
     let (runtime, reachable) = (Handle::current(), mesh.clone());
+    let most = settings.config.raw.max_message_bytes + ROOM;
     // It blocks the thread that polls it.
-    let opening = spawn_blocking(move || runtime.block_on(reachable.open_when_reachable()));
+    let opening = spawn_blocking(move || runtime.block_on(reachable.open_when_reachable(most)));
     let session = tokio::select! {
         session = opening => session.context("the session could not be opened")??,
+        () = tell_waiting(mesh) => return Ok(()),
         () = signals.next() => return Ok(()),
     };
     let robot = settings.prefix.to_string();
@@ -157,6 +166,19 @@ async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow:
     };
     daemon::run(session, settings, shutdown).await?;
     Ok(())
+}
+
+/// Says again and again that nobody has answered yet.
+async fn tell_waiting(mesh: &SessionArguments) {
+    let endpoints = mesh.endpoints().join(", ");
+    loop {
+        tokio::time::sleep(WAITING).await;
+        tracing::warn!(
+            "nobody answers at {endpoints}, or lets us in: is a router there, with a certificate \
+             of our authority, and are our certificate, name and password those it knows? It is \
+             tried again; GMAPD_LOG=zenoh_transport=debug,zenoh=debug tells more"
+        );
+    }
 }
 
 async fn tell_where(session: &zenoh::Session, robot: &str) {

@@ -1,10 +1,24 @@
 //! How a subcommand gets onto the mesh.
 
-use std::path::PathBuf;
+use std::fs::File;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow};
 use clap::Args;
 use gmapd::daemon::keys::plain_message;
+
+/// Above it, a message is dropped piece by piece; Zenoh's own is 1 GiB.
+const MAX_MESSAGE: &str = "transport/link/rx/max_message_size";
+
+/// Files that Zenoh's configuration names.
+const SECRETS: [&str; 6] = [
+    "transport/auth/usrpwd/dictionary_file",
+    "transport/link/tls/root_ca_certificate",
+    "transport/link/tls/listen_certificate",
+    "transport/link/tls/listen_private_key",
+    "transport/link/tls/connect_certificate",
+    "transport/link/tls/connect_private_key",
+];
 
 /// Where the mesh is.
 ///
@@ -36,11 +50,16 @@ impl SessionArguments {
         self.open_with(self.config()?).await
     }
 
-    /// Opens the session as soon as one of `--connect` answers, however long that takes.
-    pub(crate) async fn open_when_reachable(&self) -> anyhow::Result<zenoh::Session> {
+    /// Opens the session as soon as one of `--connect` answers, however long that takes. Messages
+    /// of more bytes than this are dropped before they are whole, unless the file says how many.
+    pub(crate) async fn open_when_reachable(&self, most: usize) -> anyhow::Result<zenoh::Session> {
         let mut config = self.config()?;
         if !self.connect.is_empty() {
             insert(&mut config, "connect/timeout_ms", "-1")?;
+        }
+        let told = config.get_json(MAX_MESSAGE).map_err(|error| anyhow!(plain_message(&error)))?;
+        if zenoh::Config::default().get_json(MAX_MESSAGE).is_ok_and(|default| default == told) {
+            insert(&mut config, MAX_MESSAGE, &most.to_string())?;
         }
         self.open_with(config).await
     }
@@ -57,7 +76,7 @@ impl SessionArguments {
                 error.context("cannot open a Zenoh session")
             } else {
                 error.context(format!(
-                    "cannot open a Zenoh session; does anybody listen at {}?",
+                    "cannot open a Zenoh session; does anybody listen at {}, and let us in?",
                     self.connect.join(", ")
                 ))
             }
@@ -66,10 +85,8 @@ impl SessionArguments {
 
     fn config(&self) -> anyhow::Result<zenoh::Config> {
         let mut config = match &self.zenoh {
-            Some(path) => zenoh::Config::from_file(path).map_err(|error| {
-                anyhow!(plain_message(&error))
-                    .context(format!("cannot use Zenoh's configuration {}", path.display()))
-            })?,
+            Some(path) => with_secrets(path)
+                .with_context(|| format!("cannot use Zenoh's configuration {}", path.display()))?,
             None => zenoh::Config::default(),
         };
         if !self.connect.is_empty() {
@@ -83,6 +100,24 @@ impl SessionArguments {
         }
         Ok(config)
     }
+}
+
+/// Zenoh's configuration from a file. The files of keys and passwords that it names are looked for
+/// here, as Zenoh does, and beside it; Zenoh itself tells nobody that one is missing.
+fn with_secrets(path: &Path) -> anyhow::Result<zenoh::Config> {
+    let plain = |error: zenoh::Error| anyhow!(plain_message(&error));
+    let mut config = zenoh::Config::from_file(path).map_err(plain)?;
+    for key in SECRETS {
+        let value = config.get_json(key).map_err(plain)?;
+        let Some(named) = serde_json::from_str::<Option<PathBuf>>(&value)? else { continue };
+        let beside = path.parent().unwrap_or(Path::new("")).join(&named);
+        let found = [&named, &beside].into_iter().find(|file| file.exists());
+        let found =
+            found.with_context(|| format!("{key}: there is no file {}", beside.display()))?;
+        File::open(found).with_context(|| format!("{key}: cannot read {}", found.display()))?;
+        insert(&mut config, key, &serde_json::to_string(found)?)?;
+    }
+    Ok(config)
 }
 
 fn json(endpoints: &[String]) -> anyhow::Result<String> {
@@ -119,6 +154,22 @@ mod tests {
         let config = config(&["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"], &[]).unwrap();
         let endpoints = config.get_json("connect/endpoints").unwrap();
         assert_eq!(endpoints, r#"["tcp/10.0.0.1:7447","tcp/10.0.0.2:7447"]"#);
+    }
+
+    #[test]
+    fn files_of_keys_are_found_beside_the_configuration_or_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("robot.json5");
+        let text = r#"{ transport: { link: { tls: { root_ca_certificate: "ca/a.pem" } } } }"#;
+        std::fs::write(&path, text).unwrap();
+        let error = format!("{:#}", with_secrets(&path).unwrap_err());
+        assert!(error.starts_with("transport/link/tls/root_ca_certificate: there is no file /"));
+        assert!(error.ends_with("ca/a.pem"), "{error}");
+        std::fs::create_dir(directory.path().join("ca")).unwrap();
+        let authority = directory.path().join("ca/a.pem");
+        std::fs::write(&authority, "").unwrap();
+        let used = with_secrets(&path).unwrap().get_json(SECRETS[1]).unwrap();
+        assert_eq!(used, serde_json::to_string(&authority).unwrap());
     }
 
     #[test]

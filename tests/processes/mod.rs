@@ -97,8 +97,12 @@ impl Background {
     }
 
     pub(crate) fn interrupt(&self) {
+        self.signal("-INT");
+    }
+
+    pub(crate) fn signal(&self, signal: &str) {
         let id = self.child.id().to_string();
-        let killed = Command::new("kill").args(["-INT", &id]).status().expect("kill is there");
+        let killed = Command::new("kill").args([signal, &id]).status().expect("kill is there");
         assert!(killed.success());
     }
 
