@@ -9,6 +9,9 @@ Needs eclipse-zenoh and numpy, and nothing else:
         map = mirror.wait_for(lambda map: map.version > 0)
         print(map.version, map.resolution, map.origin, map.cells.shape)
 
+Whoever neither closes the session nor uses `with` waits for ever at the end of the program: Zenoh's
+threads keep it.
+
 What is held is always one version as a whole, never a mixture of two. What was lost on the way is
 asked for. `docs/mesh.md` of gmapd describes the messages.
 """

@@ -6,6 +6,7 @@
 
 import argparse
 import json
+import sys
 
 import numpy as np
 import zenoh
@@ -54,7 +55,11 @@ def main():
 
     with zenoh.open(config(options.connect)) as session:
         with MapMirror(session, options.robot) as mirror:
-            map = mirror.wait_for(lambda map: map.version > 0, options.seconds)
+            try:
+                map = mirror.wait_for(lambda map: map.version > 0, options.seconds)
+            except TimeoutError:
+                state = "has no map yet" if mirror.is_alive else "is not on this mesh"
+                sys.exit(f"{options.robot} {state} after {options.seconds:g} s {mirror.last_error or ''}")
             figure, axes = pyplot.subplots()
             draw(axes, map)
             if options.out:

@@ -371,6 +371,21 @@ fn the_page_shows_a_robot_until_it_is_gone() {
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 
+#[test]
+fn what_cannot_be_downloaded_and_who_does_not_answer_is_said() {
+    let daemon = Daemon::start("robot01");
+    let view = View::on_loopback(&daemon);
+    let mut page = Browser::start().open(&view.url);
+    page.until("document.querySelector('#state b').textContent === 'waiting for scans'");
+    page.click("[data-format=pgm]");
+    page.until("said.className === 'bad' && said.textContent.startsWith('PGM: there is no map')");
+    // It is alive until its link is missed.
+    daemon.background.signal("-STOP");
+    page.until("document.querySelector('#state b').textContent === 'does not answer'");
+    daemon.background.signal("-CONT");
+    page.until("document.querySelector('#state b').textContent === 'waiting for scans'");
+}
+
 /// Counts what is drawn from now on, by colour.
 const COUNT_DRAWING: &str = "(() => {
     window.drawn = {};

@@ -177,10 +177,8 @@ async fn socket(
     Query(whom): Query<Whom>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let robot = match whom.robot.as_deref().map(Prefix::parse).transpose() {
-        Ok(robot) => robot,
-        Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
-    };
+    // No robot has a name that is none.
+    let robot = whom.robot.as_deref().and_then(|name| Prefix::parse(name).ok());
     let fleet = site.fleet.clone();
     upgrade.on_upgrade(move |socket| page::talk(socket, fleet, robot))
 }

@@ -8,8 +8,8 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 
 let robot = parameters.get("robot");
 let socket, retry, robots = [], tool = null, drag = null;
-// What is known of the robot.
-let scene = {}, trail = [], tiles = new Map(), head = null;
+// What is known of the robot, and whether it left the last question unanswered.
+let scene = {}, trail = [], tiles = new Map(), head = null, isSilent = false;
 // Tiles of a version that is not whole yet, and whether it has none of those before.
 let arriving = new Map(), isAnew = false;
 // Metres at the middle of the canvas, CSS pixels a metre.
@@ -43,7 +43,7 @@ function connect() {
 }
 
 function forget() {
-  [scene, trail, tiles, head] = [{}, [], new Map(), null];
+  [scene, trail, tiles, head, isSilent] = [{}, [], new Map(), null, false];
   [arriving, isAnew] = [new Map(), false];
 }
 
@@ -68,10 +68,12 @@ async function take(data) {
     if (news.robots) takeRobots(news.robots);
     if (news.path) trail = news.path.slice(-2);
     if (news.pose && scene.path) follow(news.pose);
+    if ("status" in news) isSilent = news.status === null;
     // Who does not answer is shown as it was.
-    if (news.status === null) delete news.status;
+    if (isSilent) delete news.status;
     Object.assign(scene, news);
     if (news.status) showStatus(news.status);
+    else if (isSilent) show();
   }
   requestDraw();
 }
@@ -153,6 +155,8 @@ function show() {
   document.title = robot ? `${robot} – gmapd` : "gmapd";
   if (robot === null) {
     showState("warning", "no robot", "No gmapd run is alive on this mesh.");
+  } else if (isAlive() && isSilent) {
+    showState("warning", "does not answer", "What is shown was last seen.");
   } else if (isAlive() && scene.status) {
     showStatus(scene.status);
   } else if (isAlive()) {
@@ -447,6 +451,25 @@ function use(name) {
   say(HINTS[tool] ?? "");
   requestDraw();
 }
+
+// By hand, so that what is wrong is said here and not on a page in its place.
+async function download(event) {
+  event.preventDefault();
+  const { href, textContent: format } = event.currentTarget;
+  if (!href) return;
+  try {
+    const answer = await fetch(href);
+    if (!answer.ok) return say(`${format}: ${await answer.text()}`, "bad");
+    const file = make("a");
+    [, file.download] = answer.headers.get("content-disposition").match(/filename="(.*)"/);
+    file.href = URL.createObjectURL(await answer.blob());
+    file.click();
+    setTimeout(() => URL.revokeObjectURL(file.href), 60000);
+  } catch (error) {
+    say(`${format}: ${error.message}`, "bad");
+  }
+}
+for (const link of all("[data-format]")) link.onclick = download;
 
 async function command(name, values = {}) {
   try {
