@@ -5,7 +5,7 @@
 //! interpolated occupancy.
 
 use nalgebra::{Matrix3, Vector3};
-use wide::f32x4;
+use wide::{CmpEq as _, f32x4};
 
 use super::super::grid::Cell;
 use super::super::grid::log_odds::{LogOdds, LogOddsMap, Probabilities};
@@ -19,6 +19,8 @@ const LONGEST_STEP: f64 = 2.0;
 const SHORTEST_STEP: f64 = 0.005;
 /// Points that are looked at together.
 const LANES: usize = 4;
+/// A bit for each of them.
+const EVERY_LANE: i32 = 0b1111;
 /// Room for the pose to move within a window, cells of the coarsest map.
 pub(super) const MARGIN: f64 = 24.0;
 
@@ -173,26 +175,28 @@ impl<'a> Level<'a> {
             let turned = [cos * px - sin * py, sin * px + cos * py];
             let (columns, fx) = split(x + turned[0]);
             let (rows, fy) = split(y + turned[1]);
-            if four.cells != [columns, rows] {
-                self.look_up(four, [columns, rows]);
-            }
-            add(&mut sums, turned, &four.squares, [fx, fy]);
+            self.look_up(four, [columns, rows]);
+            add(&mut sums, turned, four.squares.map(f32x4::from), [fx, fy]);
         }
         self.in_metres(sums.map(|sum| sum.to_array().into_iter().map(f64::from).sum()))
     }
 
+    /// Looks up the squares of points that have left theirs.
     #[inline]
     fn look_up(&self, four: &mut Four, cells: [f32x4; 2]) {
+        let [columns, rows] = [0, 1].map(|axis| four.cells[axis].cmp_eq(cells[axis]));
+        let stayed = (columns & rows).move_mask();
+        if stayed == EVERY_LANE {
+            return;
+        }
         four.cells = cells;
         let [columns, rows] = cells.map(indices);
-        let mut squares = four.squares.map(f32x4::to_array);
-        for lane in 0..four.count {
+        for lane in (0..four.count).filter(|lane| stayed & 1 << lane == 0) {
             let square = self.window.square(columns[lane], rows[lane]);
-            for (corner, cell) in squares.iter_mut().zip(square) {
+            for (corner, cell) in four.squares.iter_mut().zip(square) {
                 corner[lane] = self.probabilities.of(cell);
             }
         }
-        four.squares = squares.map(f32x4::from);
     }
 
     /// 1 - (1 - M)² on average over the points.
@@ -294,7 +298,7 @@ struct Four {
     cells: [f32x4; 2],
     /// Probabilities of the cells around: lower left, lower right, upper left and upper right.
     /// Points that are not there lie in occupied cells, and so say nothing.
-    squares: [f32x4; 4],
+    squares: [[f32; LANES]; 4],
 }
 
 impl Four {
@@ -304,15 +308,15 @@ impl Four {
             count: points.len(),
             points: [0, 1].map(|axis| f32x4::from([0, 1, 2, 3].map(|lane| point(lane)[axis]))),
             cells: [f32x4::ZERO; 2],
-            squares: [f32x4::ONE; 4],
+            squares: [[1.0; LANES]; 4],
         }
     }
 }
 
 /// Adds what four points say: turned with the base, in squares at these fractions of their sides.
 #[inline]
-fn add(sums: &mut [f32x4; 10], [rx, ry]: [f32x4; 2], squares: &[f32x4; 4], [fx, fy]: [f32x4; 2]) {
-    let [m00, m10, m01, m11] = *squares;
+fn add(sums: &mut [f32x4; 10], [rx, ry]: [f32x4; 2], square: [f32x4; 4], [fx, fy]: [f32x4; 2]) {
+    let [m00, m10, m01, m11] = square;
     let (bottom, left) = (m10 - m00, m01 - m00);
     let dx = bottom + fy * ((m11 - m01) - bottom);
     let dy = left + fx * ((m11 - m10) - left);

@@ -18,6 +18,8 @@ const SHORTEST: f32 = 0.2;
 const GAP: f32 = 0.2;
 /// ... unless they are nearer than this, m.
 const SMALL_GAP: f32 = 0.2;
+/// So many hits tell the directions well enough.
+const ENOUGH: usize = 180;
 /// A direction is weak if less than this share of the surfaces stands against it.
 const WEAK: f64 = 0.015;
 
@@ -74,7 +76,8 @@ fn surfaces(hits: &[[f32; 2]], lever: f64) -> (Matrix3<f64>, u32) {
     let along = lengths(hits);
     let (mut sum, mut count) = (Matrix3::zeros(), 0);
     let (mut first, mut last) = (0, 0);
-    for (index, &[x, y]) in hits.iter().enumerate() {
+    let every = hits.len().div_ceil(ENOUGH).max(1);
+    for (index, &[x, y]) in hits.iter().enumerate().step_by(every) {
         while along[index] - along[first] > REACH {
             first += 1;
         }
@@ -101,10 +104,10 @@ fn lengths(hits: &[[f32; 2]]) -> Vec<f64> {
     let mut before: Option<[f32; 2]> = None;
     let step = |hit: &[f32; 2]| {
         if let Some([bx, by]) = before.replace(*hit) {
-            let ([x, y], range) = (*hit, (bx * bx + by * by).sqrt());
-            let gap = ((x - bx) * (x - bx) + (y - by) * (y - by)).sqrt();
-            let apart = gap > SMALL_GAP.max(GAP * range);
-            length += if apart { 1e3 } else { f64::from(gap).min(REACH) };
+            let ([x, y], squared_range) = (*hit, bx * bx + by * by);
+            let squared_gap = (x - bx) * (x - bx) + (y - by) * (y - by);
+            let apart = squared_gap > (SMALL_GAP * SMALL_GAP).max(GAP * GAP * squared_range);
+            length += if apart { 1e3 } else { f64::from(squared_gap.sqrt()).min(REACH) };
         }
         length
     };
