@@ -18,8 +18,6 @@ const SHORTEST: f32 = 0.2;
 const GAP: f32 = 0.2;
 /// ... unless they are nearer than this, m.
 const SMALL_GAP: f32 = 0.2;
-/// So many hits tell the directions well enough.
-const ENOUGH: usize = 180;
 /// A direction is weak if less than this share of the surfaces stands against it.
 const WEAK: f64 = 0.015;
 
@@ -76,8 +74,7 @@ fn surfaces(hits: &[[f32; 2]], lever: f64) -> (Matrix3<f64>, u32) {
     let along = lengths(hits);
     let (mut sum, mut count) = (Matrix3::zeros(), 0);
     let (mut first, mut last) = (0, 0);
-    let every = hits.len().div_ceil(ENOUGH).max(1);
-    for (index, &[x, y]) in hits.iter().enumerate().step_by(every) {
+    for (index, &[x, y]) in hits.iter().enumerate() {
         while along[index] - along[first] > REACH {
             first += 1;
         }
