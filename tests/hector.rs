@@ -3,6 +3,7 @@
 use gmapd::sim::lidar::Lidar;
 use gmapd::sim::{Place, Scenario, Simulation};
 use gmapd::slam::engine::Sweep;
+use gmapd::slam::grid::footprint::Footprint;
 use gmapd::slam::grid::log_odds::{CLAMP, Evidence, LogOdds, LogOddsMap, Probabilities};
 use gmapd::slam::hector::correlation::Search;
 use gmapd::slam::hector::gauss_newton::Level;
@@ -90,7 +91,8 @@ fn drawn_map() -> LogOddsMap {
     let ranges = (0..720).map(|i| 0.7 + 0.3 * (f64::from(i) * 0.05).sin() as f32).collect();
     let scan = Scan { stamp: Stamp(0), geometry: lidar.geometry, ranges };
     let scan = Directions::default().prepare(&scan, &lidar.mount, &parameters);
-    map.add(&scan.outline, Pose2::new(1.0, 1.0, 0.3), evidence(), |_| ());
+    let mut footprint = Footprint::default();
+    map.add(footprint.of(&scan.outline, Pose2::new(1.0, 1.0, 0.3), 0.05), evidence());
     map
 }
 

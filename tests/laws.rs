@@ -12,6 +12,7 @@ use gmapd::slam::gmapping::prepared_scan::PreparedScan;
 use gmapd::slam::gmapping::scan_matcher::FieldMatcher;
 use gmapd::slam::gmapping::{GMapping, MatcherParameters, Parameters, ScanReading, ScanUpdate};
 use gmapd::slam::grid::Cell;
+use gmapd::slam::grid::footprint::Footprint;
 use gmapd::slam::grid::hit_map::HitMap;
 use gmapd::slam::grid::likelihood_field::{
     FULL, Kernel, LikelihoodField, Points, Window, WindowPose,
@@ -339,12 +340,14 @@ proptest! {
         near in poses(),
     ) {
         let [free, occupied] = [0.4, 0.9].map(LogOdds::of_probability);
-        let mut map = LogOddsMap::new(0.05);
+        let (mut map, mut footprint) = (LogOddsMap::new(0.05), Footprint::default());
         let mut expected: BTreeMap<Cell, LogOdds> = BTreeMap::new();
         let mut touched = BTreeSet::new();
         for (scan, beside, turn) in &scans {
             let pose = near * Pose2::new(*beside, -*beside, *turn);
-            map.add(scan, pose, Evidence { free, occupied }, |tile| touched.extend([tile]));
+            let tiles = footprint.of(scan, pose, 0.05);
+            map.add(tiles, Evidence { free, occupied });
+            touched.extend(tiles.iter().map(|(tile, _)| *tile));
             let mut counts = OccupancyMap::new(0.05);
             counts.add(scan, pose);
             for (cell, count) in seen(&counts) {

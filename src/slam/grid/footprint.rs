@@ -16,7 +16,7 @@ const WIDEST_BEAM: f64 = 0.04;
 /// What a scan saw of a tile: for each row a bit for each column, the lowest for the first. No cell
 /// is both.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Seen {
+pub struct Seen {
     /// Cells that beams passed.
     pub(super) free: [u16; TILE_SIZE],
     /// Cells that beams ended in.
@@ -24,15 +24,54 @@ pub(super) struct Seen {
 }
 
 impl Seen {
-    /// Whether every cell is free.
-    pub(super) fn is_free(&self) -> bool {
-        self.free == [u16::MAX; TILE_SIZE]
+    /// Adds what was seen in cells of half the size, which fill one half of the columns and one of
+    /// the rows: hit if one of four cells is, free if two of them that meet at the middle are.
+    fn add_halved(&mut self, small: &Self, [right, upper]: [bool; 2]) {
+        let (columns, rows) = (if right { 8 } else { 0 }, if upper { 8 } else { 0 });
+        for row in 0..TILE_SIZE / 2 {
+            let [low, high] = [2 * row, 2 * row + 1];
+            let hit = small.hit[low] | small.hit[high];
+            let hit = every_second(hit | hit >> 1);
+            let (low, high) = (small.free[low], small.free[high]);
+            let free = every_second(low & high >> 1 | low >> 1 & high);
+            self.hit[rows + row] |= hit << columns;
+            self.free[rows + row] |= (free & !hit) << columns;
+        }
     }
+}
+
+/// The first, third, fifth, ... bit, side by side.
+const fn every_second(bits: u16) -> u16 {
+    let bits = bits & 0x5555;
+    let bits = (bits | bits >> 1) & 0x3333;
+    let bits = (bits | bits >> 2) & 0x0f0f;
+    (bits | bits >> 4) & 0x00ff
+}
+
+/// What a scan saw, row by row, in cells of twice the size.
+#[must_use]
+pub fn halved(tiles: &[(TileKey, Seen)]) -> Vec<(TileKey, Seen)> {
+    let mut halves = Vec::with_capacity(tiles.len());
+    for rows in tiles.chunk_by(|(a, _), (b, _)| a.ty >> 1 == b.ty >> 1) {
+        let columns = rows.iter().map(|(key, _)| key.tx >> 1);
+        let (first, last) = columns.fold((i32::MAX, i32::MIN), |(a, b), tx| (a.min(tx), b.max(tx)));
+        let mut row = vec![None; (last - first + 1) as usize];
+        for (TileKey { ty, tx }, seen) in rows {
+            let half: &mut Seen = row[((tx >> 1) - first) as usize].get_or_insert_default();
+            half.add_halved(seen, [tx & 1 == 1, ty & 1 == 1]);
+        }
+        let ty = rows[0].0.ty >> 1;
+        let tiles = (first..).zip(row).filter_map(|(tx, seen)| Some((TileKey { ty, tx }, seen?)));
+        halves.extend(tiles);
+    }
+    halves
 }
 
 /// Finds the cells; its buffers keep their memory from scan to scan.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Footprint {
+pub struct Footprint {
+    /// What was seen of each tile.
+    tiles: Vec<(TileKey, Seen)>,
     /// Of the free polygon, in cells.
     corners: Vec<Point2>,
     hits: Vec<Cell>,
@@ -45,10 +84,10 @@ pub(super) struct Footprint {
 }
 
 /// Where an edge of the polygon crosses the middle of a row of cells.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Crossing {
-    /// In cells.
-    x: f64,
+    /// The first cell whose centre is not before it, counted from the first column that is used.
+    column: i32,
     /// 1 for an edge that goes up, -1 for one that goes down.
     direction: i32,
 }
@@ -64,24 +103,24 @@ struct Column {
 }
 
 impl Footprint {
-    /// Calls `take` with what the scan saw of each tile, taken with the base at `map_from_base`, for
-    /// cells of `resolution` metres.
-    pub(super) fn of(
+    /// What the scan saw of each tile, taken with the base at `map_from_base`, for cells of
+    /// `resolution` metres.
+    pub fn of(
         &mut self,
         scan: &ScanOutline,
         map_from_base: Pose2,
         resolution: f64,
-        mut take: impl FnMut(TileKey, &Seen),
-    ) {
+    ) -> &[(TileKey, Seen)] {
+        self.tiles.clear();
         self.outline(scan, map_from_base, resolution);
         let (low, high) = self.bounds();
         self.fill_rows(low, high);
         let (rows, _) = self.rows.as_chunks_mut::<TILE_SIZE>();
         for ((ty, rows), hits) in (low.ty..=high.ty).zip(rows).zip(&mut self.hits_by_row) {
             for (row, crossings) in rows.iter_mut().enumerate() {
-                sort(crossings);
+                crossings.sort_unstable();
                 for_each_inside(crossings, |start, end| {
-                    push_free(&mut self.columns, low.tx, row, (start, end));
+                    push_free(&mut self.columns, row, start, end);
                 });
                 crossings.clear();
             }
@@ -93,10 +132,11 @@ impl Footprint {
             for (tx, column) in (low.tx..=high.tx).zip(&mut self.columns) {
                 whole ^= std::mem::take(&mut column.toggled);
                 if whole != 0 || column.touched {
-                    take(TileKey { ty, tx }, &column.finish(whole));
+                    self.tiles.push((TileKey { ty, tx }, column.finish(whole)));
                 }
             }
         }
+        &self.tiles
     }
 
     /// Finds the free polygon's corners, and the cells that beams end in.
@@ -168,10 +208,12 @@ impl Footprint {
         grow(&mut self.rows, height * TILE_SIZE);
         grow(&mut self.hits_by_row, height);
         grow(&mut self.columns, width);
-        let bottom = low.first_cell().iy;
-        let next = self.corners.iter().cycle().skip(1);
-        for (a, b) in self.corners.iter().zip(next) {
-            cross_rows(&mut self.rows, bottom, *a, *b);
+        let first = low.first_cell();
+        let corner = |at: &Point2| Corner { at: *at, row: first_centre(at.y) };
+        let mut before = corner(&self.corners[self.corners.len() - 1]);
+        for here in self.corners.iter().map(corner) {
+            cross_rows(&mut self.rows, first, before, here);
+            before = here;
         }
         for hit in &self.hits {
             self.hits_by_row[(place(hit.iy).0 - low.ty) as usize].push(*hit);
@@ -213,13 +255,10 @@ impl Column {
 }
 
 /// Takes the cells of a row from `start` up to `end`, not included, as free.
-fn push_free(columns: &mut [Column], left: i32, row: usize, (start, end): (i32, i32)) {
-    if start >= end {
-        return;
-    }
-    let ((first, start), (last, end)) = (place(start), place(end));
-    let (first, last) = ((first - left) as usize, (last - left) as usize);
-    let (from_start, before_end) = (u16::MAX << start, !(u16::MAX << end));
+fn push_free(columns: &mut [Column], row: usize, start: usize, end: usize) {
+    let (first, last) = (start / TILE_SIZE, end / TILE_SIZE);
+    let from_start = u16::MAX << (start % TILE_SIZE);
+    let before_end = !(u16::MAX << (end % TILE_SIZE));
     if first == last {
         return columns[first].push_free(row, from_start & before_end);
     }
@@ -265,18 +304,26 @@ impl Arm {
     }
 }
 
+/// A corner of the polygon.
+#[derive(Debug, Clone, Copy)]
+struct Corner {
+    /// In cells.
+    at: Point2,
+    /// The first row whose middle is not below it.
+    row: i32,
+}
+
 /// Notes where the edge from `a` to `b` crosses the middles of rows, and which way.
-fn cross_rows(rows: &mut [Vec<Crossing>], bottom: i32, a: Point2, b: Point2) {
-    let (low, high, direction) = if a.y < b.y { (a, b, 1) } else { (b, a, -1) };
-    let (start, end) = (first_centre(low.y), first_centre(high.y));
-    if start >= end {
+fn cross_rows(rows: &mut [Vec<Crossing>], first: Cell, a: Corner, b: Corner) {
+    if a.row == b.row {
         return;
     }
-    let slope = (high.x - low.x) / (high.y - low.y);
-    let rows = &mut rows[(start - bottom) as usize..(end - bottom) as usize];
-    for (iy, row) in (start..).zip(rows) {
-        let x = low.x + slope * (f64::from(iy) + 0.5 - low.y);
-        row.push(Crossing { x, direction });
+    let (low, high, direction) = if a.row < b.row { (a, b, 1) } else { (b, a, -1) };
+    let slope = (high.at.x - low.at.x) / (high.at.y - low.at.y);
+    let rows = &mut rows[(low.row - first.iy) as usize..(high.row - first.iy) as usize];
+    for (iy, row) in (low.row..).zip(rows) {
+        let x = low.at.x + slope * (f64::from(iy) + 0.5 - low.at.y);
+        row.push(Crossing { column: first_centre(x) - first.ix, direction });
     }
 }
 
@@ -285,29 +332,18 @@ fn first_centre(x: f64) -> i32 {
     -floor(0.5 - x)
 }
 
-/// From left to right. Beams come in the order of their angles, and so the crossings of a row are
-/// nearly sorted one way or the other.
-fn sort(crossings: &mut [Crossing]) {
-    if let [first, .., last] = crossings
-        && first.x > last.x
-    {
-        crossings.reverse();
-    }
-    crossings.sort_by(|a, b| a.x.total_cmp(&b.x));
-}
-
 /// Calls `take` with the first and one past the last cell of each stretch inside the polygon, by
 /// the non-zero winding rule: beams that overlap after a full turn do not cancel each other.
-fn for_each_inside(crossings: &[Crossing], mut take: impl FnMut(i32, i32)) {
+fn for_each_inside(crossings: &[Crossing], mut take: impl FnMut(usize, usize)) {
     let mut winding = 0;
-    let mut from = 0.0;
+    let mut start = 0;
     for crossing in crossings {
         if winding == 0 {
-            from = crossing.x;
+            start = crossing.column;
         }
         winding += crossing.direction;
-        if winding == 0 {
-            take(first_centre(from), first_centre(crossing.x));
+        if winding == 0 && start < crossing.column {
+            take(start as usize, crossing.column as usize);
         }
     }
 }

@@ -6,10 +6,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::super::pose::{Point2, Pose2};
+use super::super::pose::Point2;
 use super::Cell;
-use super::footprint::Footprint;
-use super::occupancy::ScanOutline;
+use super::footprint::Seen;
 use super::tile_map::{TILE_SIZE, TileKey, TileMap};
 
 /// Steps of the fixed-point log-odds in a nat.
@@ -108,6 +107,9 @@ impl Evidence {
         if free | hit == 0 {
             return;
         }
+        if free == u16::MAX {
+            return row.iter_mut().for_each(|value| *value = value.and(self.free));
+        }
         for (column, value) in row.iter_mut().enumerate() {
             let bit = 1_u16 << column;
             let free = if free & bit == 0 { 0 } else { self.free.0 };
@@ -122,7 +124,6 @@ impl Evidence {
 pub struct LogOddsMap {
     resolution: f64,
     cells: TileMap<LogOdds>,
-    footprint: Footprint,
 }
 
 impl LogOddsMap {
@@ -134,7 +135,7 @@ impl LogOddsMap {
 
     /// The map with these cells.
     pub(in super::super) fn of_cells(resolution: f64, cells: TileMap<LogOdds>) -> Self {
-        Self { resolution, cells, footprint: Footprint::default() }
+        Self { resolution, cells }
     }
 
     /// Metres a cell.
@@ -149,27 +150,19 @@ impl LogOddsMap {
         &self.cells
     }
 
-    /// Enters a scan taken with the base at `map_from_base`, and calls `touched` with each tile
-    /// that it changes.
-    pub fn add(
-        &mut self,
-        scan: &ScanOutline,
-        map_from_base: Pose2,
-        evidence: Evidence,
-        mut touched: impl FnMut(TileKey),
-    ) {
-        let Self { resolution, cells, footprint } = self;
-        footprint.of(scan, map_from_base, *resolution, |key, seen| {
-            touched(key);
-            let tile = cells.tile_mut(key);
-            if seen.is_free() {
-                return tile.iter_mut().for_each(|value| *value = value.and(evidence.free));
+    /// Enters what a scan saw of each tile.
+    pub fn add(&mut self, tiles: &[(TileKey, Seen)], evidence: Evidence) {
+        for (key, seen) in tiles {
+            let tile = self.cells.tile_mut(*key);
+            if seen.free == [u16::MAX; TILE_SIZE] {
+                tile.iter_mut().for_each(|value| *value = value.and(evidence.free));
+                continue;
             }
             let (rows, _) = tile.as_chunks_mut::<TILE_SIZE>();
             for ((row, free), hit) in rows.iter_mut().zip(seen.free).zip(seen.hit) {
                 evidence.enter(row, free, hit);
             }
-        });
+        }
     }
 
     /// Takes a cell as occupied, at least in part.

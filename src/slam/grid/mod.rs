@@ -1,6 +1,6 @@
 //! Grids of square cells without bounds: copy-on-write tiles, and what is kept in them.
 
-mod footprint;
+pub mod footprint;
 pub mod hit_map;
 pub mod likelihood_field;
 pub mod log_odds;

@@ -159,8 +159,8 @@ impl OccupancyMap {
             Change::Remove => u32::MAX,
         };
         let Self { resolution, counts, footprint } = self;
-        footprint.of(scan, map_from_base, *resolution, |key, seen| {
-            let (rows, _) = counts.tile_mut(key).as_chunks_mut::<TILE_SIZE>();
+        for (key, seen) in footprint.of(scan, map_from_base, *resolution) {
+            let (rows, _) = counts.tile_mut(*key).as_chunks_mut::<TILE_SIZE>();
             for ((row, free), hit) in rows.iter_mut().zip(seen.free).zip(seen.hit) {
                 for (column, count) in row.iter_mut().enumerate() {
                     let [free, hit] = [free, hit].map(|row| u32::from(row >> column & 1));
@@ -168,7 +168,7 @@ impl OccupancyMap {
                     count.visits = count.visits.wrapping_add((free | hit) * one);
                 }
             }
-        });
+        }
     }
 
     /// The map as it is handed out, cropped to the cells that were seen; `None` if there are none.

@@ -5,7 +5,7 @@
 //! interpolated occupancy.
 
 use nalgebra::{Matrix3, Vector3};
-use wide::f32x4;
+use wide::{CmpEq as _, f32x4};
 
 use super::super::grid::Cell;
 use super::super::grid::log_odds::{LogOdds, LogOddsMap, Probabilities};
@@ -19,6 +19,8 @@ const LONGEST_STEP: f64 = 2.0;
 const SHORTEST_STEP: f64 = 0.005;
 /// Points that are looked at together.
 const LANES: usize = 4;
+/// A bit for each of them.
+const EVERY_LANE: i32 = 0b1111;
 /// Room for the pose to move within a window, cells of the coarsest map.
 pub(super) const MARGIN: f64 = 24.0;
 
@@ -154,58 +156,46 @@ impl<'a> Level<'a> {
     /// How the scan fits with the base at `pose`.
     #[must_use]
     pub fn fit(&self, pose: Pose2) -> Fit {
-        let base = self.in_window(pose).map(|cells| f32x4::splat(cells as f32));
+        self.fit_again(pose, &mut self.fours())
+    }
+
+    /// The points, before any cell is looked up.
+    fn fours(&self) -> Vec<Four> {
+        self.points.chunks(LANES).map(Four::new).collect()
+    }
+
+    /// The same, with the cells that were looked up for a pose before.
+    fn fit_again(&self, pose: Pose2, fours: &mut [Four]) -> Fit {
+        let [x, y] = self.in_window(pose).map(|cells| f32x4::splat(cells as f32));
         let (sin, cos) = libm::sincos(pose.theta);
-        let rotation = [sin, cos].map(|value| f32x4::splat(value as f32));
+        let [sin, cos] = [sin, cos].map(|value| f32x4::splat(value as f32));
         let mut sums = [f32x4::ZERO; 10];
-        for points in self.points.chunks(LANES) {
-            self.add(&mut sums, points, (base, rotation));
+        for four in fours {
+            let [px, py] = four.points;
+            let turned = [cos * px - sin * py, sin * px + cos * py];
+            let (columns, fx) = split(x + turned[0]);
+            let (rows, fy) = split(y + turned[1]);
+            self.look_up(four, [columns, rows]);
+            add(&mut sums, turned, four.squares.map(f32x4::from), [fx, fy]);
         }
         self.in_metres(sums.map(|sum| sum.to_array().into_iter().map(f64::from).sum()))
     }
 
-    /// Adds what up to four points say. Cells are looked up one by one; everything else is done for
-    /// all four at once.
+    /// Looks up the squares of points that have left theirs.
     #[inline]
-    fn add(
-        &self,
-        sums: &mut [f32x4; 10],
-        points: &[[f32; 2]],
-        ([x, y], [sin, cos]): ([f32x4; 2], [f32x4; 2]),
-    ) {
-        let point = |lane: usize| points.get(lane).copied().unwrap_or_default();
-        let points_at = |axis| f32x4::from([0, 1, 2, 3].map(|lane| point(lane)[axis]));
-        let (px, py) = (points_at(0), points_at(1));
-        let (rx, ry) = (cos * px - sin * py, sin * px + cos * py);
-        let ((columns, fx), (rows, fy)) = (split(x + rx), split(y + ry));
-        // Points that are not there lie in occupied cells, and so say nothing.
-        let mut squares = [[1.0; LANES]; 4];
-        for lane in 0..points.len() {
+    fn look_up(&self, four: &mut Four, cells: [f32x4; 2]) {
+        let [columns, rows] = [0, 1].map(|axis| four.cells[axis].cmp_eq(cells[axis]));
+        let stayed = (columns & rows).move_mask();
+        if stayed == EVERY_LANE {
+            return;
+        }
+        four.cells = cells;
+        let [columns, rows] = cells.map(indices);
+        for lane in (0..four.count).filter(|lane| stayed & 1 << lane == 0) {
             let square = self.window.square(columns[lane], rows[lane]);
-            for (corner, cell) in squares.iter_mut().zip(square) {
+            for (corner, cell) in four.squares.iter_mut().zip(square) {
                 corner[lane] = self.probabilities.of(cell);
             }
-        }
-        let [m00, m10, m01, m11] = squares.map(f32x4::from);
-        let (bottom, left) = (m10 - m00, m01 - m00);
-        let dx = bottom + fy * ((m11 - m01) - bottom);
-        let dy = left + fx * ((m11 - m10) - left);
-        let residual = 1.0 - (m00 + fx * bottom + fy * dy);
-        let turn = rx * dy - ry * dx;
-        let products = [
-            residual * residual,
-            dx * residual,
-            dy * residual,
-            turn * residual,
-            dx * dx,
-            dx * dy,
-            dx * turn,
-            dy * dy,
-            dy * turn,
-            turn * turn,
-        ];
-        for (sum, product) in sums.iter_mut().zip(products) {
-            *sum += product;
         }
     }
 
@@ -225,8 +215,9 @@ impl<'a> Level<'a> {
     /// The pose of at most `steps` damped steps from `start` that fits scan and prior best.
     #[must_use]
     pub fn descend(&self, problem: &Problem<'_>, start: Pose2, steps: usize) -> (Pose2, Fit) {
+        let mut fours = self.fours();
         let mut pose = start;
-        let mut fit = self.fit(pose);
+        let mut fit = self.fit_again(pose, &mut fours);
         let mut cost = problem.cost(&fit, pose);
         let mut damping = 1e-3;
         for _ in 0..steps {
@@ -236,7 +227,7 @@ impl<'a> Level<'a> {
                 break;
             }
             let next = moved(pose, step);
-            let next_fit = self.fit(next);
+            let next_fit = self.fit_again(next, &mut fours);
             let next_cost = problem.cost(&next_fit, next);
             if next_cost <= cost {
                 (pose, fit, cost) = (next, next_fit, next_cost);
@@ -296,14 +287,71 @@ fn moved(pose: Pose2, step: Vector3<f64>) -> Pose2 {
     Pose2::new(pose.x + step.x, pose.y + step.y, wrap_angle(pose.theta + step.z))
 }
 
-/// The cells whose centres are the last before positions in cells, and how far behind them those
-/// are, 0 to 1. Positions below 0.5 have a cell beyond all windows.
+/// Up to four points, and what is around them: everything but the looking up of cells is done for
+/// all four at once, and a small step leaves most of them in the cells where they were.
+#[derive(Debug)]
+struct Four {
+    count: usize,
+    /// In the base frame, cells.
+    points: [f32x4; 2],
+    /// Of the squares, as [`split`] makes them.
+    cells: [f32x4; 2],
+    /// Probabilities of the cells around: lower left, lower right, upper left and upper right.
+    /// Points that are not there lie in occupied cells, and so say nothing.
+    squares: [[f32; LANES]; 4],
+}
+
+impl Four {
+    fn new(points: &[[f32; 2]]) -> Self {
+        let point = |lane: usize| points.get(lane).copied().unwrap_or_default();
+        Self {
+            count: points.len(),
+            points: [0, 1].map(|axis| f32x4::from([0, 1, 2, 3].map(|lane| point(lane)[axis]))),
+            cells: [f32x4::ZERO; 2],
+            squares: [[1.0; LANES]; 4],
+        }
+    }
+}
+
+/// Adds what four points say: turned with the base, in squares at these fractions of their sides.
+#[inline]
+fn add(sums: &mut [f32x4; 10], [rx, ry]: [f32x4; 2], square: [f32x4; 4], [fx, fy]: [f32x4; 2]) {
+    let [m00, m10, m01, m11] = square;
+    let (bottom, left) = (m10 - m00, m01 - m00);
+    let dx = bottom + fy * ((m11 - m01) - bottom);
+    let dy = left + fx * ((m11 - m10) - left);
+    let residual = 1.0 - (m00 + fx * bottom + fy * dy);
+    let turn = rx * dy - ry * dx;
+    let products = [
+        residual * residual,
+        dx * residual,
+        dy * residual,
+        turn * residual,
+        dx * dx,
+        dx * dy,
+        dx * turn,
+        dy * dy,
+        dy * turn,
+        turn * turn,
+    ];
+    for (sum, product) in sums.iter_mut().zip(products) {
+        *sum += product;
+    }
+}
+
+/// The cells whose centres are the last before positions in cells, shifted by 2^23, and how far
+/// behind them those are, 0 to 1. Positions below 0.5 have a cell beyond all windows.
 ///
 /// As `floor`, but without its branches: adding 2^23 leaves no room for digits behind the point.
 #[inline]
-fn split(positions: f32x4) -> ([usize; LANES], f32x4) {
+fn split(positions: f32x4) -> (f32x4, f32x4) {
     let shift = f32x4::splat(8_388_608.0);
-    let shifted = positions - 1.0 + shift;
-    let cells = shifted.to_array().map(|cell| (cell.to_bits() & 0x007f_ffff) as usize);
-    (cells, positions - 0.5 - (shifted - shift))
+    let cells = positions - 1.0 + shift;
+    (cells, positions - 0.5 - (cells - shift))
+}
+
+/// Cells that [`split`] made, to look up.
+#[inline]
+fn indices(cells: f32x4) -> [usize; LANES] {
+    cells.to_array().map(|cell| (cell.to_bits() & 0x007f_ffff) as usize)
 }

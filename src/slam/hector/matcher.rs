@@ -17,9 +17,9 @@ const FINE_STEPS: usize = 6;
 /// the descent sees: a search follows if the scan fits worse than usual, ...
 const POOR: f64 = 0.5;
 /// ... that is, by less than this share of the usual score.
-const WORSE: f64 = 0.93;
+const WORSE: f64 = 0.95;
 /// With a prediction this unsure, a search follows in any case.
-const VERY_POOR: f64 = 3.0;
+const VERY_POOR: f64 = 6.0;
 /// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
 /// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
 const LEAST_EXPLAINED: f64 = 0.7;
@@ -123,20 +123,15 @@ impl Matcher<'_> {
         let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
         let deviations = prediction.deviations();
         let unsure = deviations[0].max(deviations[1] * lever) / levels[0].resolution();
-        let search = || {
+        let near = descend(levels, &problem, pose_in_map);
+        let fits = points - near.1.cost >= WORSE * expected * points;
+        let other = (unsure > VERY_POOR || unsure > POOR && !fits).then(|| {
             let gain = SEARCH_GAIN;
             let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
             descend(levels, &problem, search.run())
-        };
-        let (pose, fit) = if unsure > VERY_POOR {
-            search()
-        } else {
-            let near = descend(levels, &problem, pose_in_map);
-            let fits = points - near.1.cost >= WORSE * expected * points;
-            let cost = |found: &(Pose2, Fit)| problem.cost(&found.1, found.0);
-            let other = (unsure > POOR && !fits).then(search);
-            other.filter(|other| cost(other) < cost(&near)).unwrap_or(near)
-        };
+        });
+        let cost = |(pose, fit): &(Pose2, Fit)| problem.cost(fit, *pose);
+        let (pose, fit) = other.filter(|other| cost(other) < cost(&near)).unwrap_or(near);
         let score = points - fit.cost;
         let (hessian, _) = weakness.without(&fit, pose.theta);
         let information = CERTAINTY * hessian + prior.information;

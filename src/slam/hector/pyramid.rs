@@ -1,6 +1,7 @@
 //! Maps of the same world in cells of growing size, each updated with every scan that enters.
 
 use super::super::grid::Cell;
+use super::super::grid::footprint::{Footprint, halved};
 use super::super::grid::log_odds::{Evidence, LogOdds, LogOddsMap, Probabilities};
 use super::super::grid::tile_map::{TileCounts, TileKey, TileMap};
 use super::super::pose::Pose2;
@@ -17,6 +18,7 @@ pub struct Pyramid {
     maps: Vec<LogOddsMap>,
     probabilities: Probabilities,
     evidence: Evidence,
+    footprint: Footprint,
 }
 
 impl Pyramid {
@@ -32,6 +34,7 @@ impl Pyramid {
                 free: LogOdds::of_probability(parameters.free_probability),
                 occupied: LogOdds::of_probability(parameters.occupied_probability),
             },
+            footprint: Footprint::default(),
         }
     }
 
@@ -61,12 +64,14 @@ impl Pyramid {
         pose_in_map: Pose2,
         mut touched: impl FnMut(TileKey),
     ) {
-        for (level, map) in self.maps.iter_mut().enumerate() {
-            map.add(&scan.outline, pose_in_map, self.evidence, |tile| {
-                if level == 0 {
-                    touched(tile);
-                }
-            });
+        let (finest, coarse) = self.maps.split_first_mut().expect("there is a finest map");
+        let seen = self.footprint.of(&scan.outline, pose_in_map, finest.resolution());
+        finest.add(seen, self.evidence);
+        seen.iter().for_each(|(tile, _)| touched(*tile));
+        let mut seen = seen.to_vec();
+        for map in coarse {
+            seen = halved(&seen);
+            map.add(&seen, self.evidence);
         }
     }
 

@@ -101,10 +101,10 @@ fn lengths(hits: &[[f32; 2]]) -> Vec<f64> {
     let mut before: Option<[f32; 2]> = None;
     let step = |hit: &[f32; 2]| {
         if let Some([bx, by]) = before.replace(*hit) {
-            let ([x, y], range) = (*hit, (bx * bx + by * by).sqrt());
-            let gap = ((x - bx) * (x - bx) + (y - by) * (y - by)).sqrt();
-            let apart = gap > SMALL_GAP.max(GAP * range);
-            length += if apart { 1e3 } else { f64::from(gap).min(REACH) };
+            let ([x, y], squared_range) = (*hit, bx * bx + by * by);
+            let squared_gap = (x - bx) * (x - bx) + (y - by) * (y - by);
+            let apart = squared_gap > (SMALL_GAP * SMALL_GAP).max(GAP * GAP * squared_range);
+            length += if apart { 1e3 } else { f64::from(squared_gap.sqrt()).min(REACH) };
         }
         length
     };
