@@ -18,7 +18,7 @@ const FINE_STEPS: usize = 6;
 const POOR: f64 = 0.5;
 /// ... that is, by less than this share of the usual score.
 const WORSE: f64 = 0.95;
-/// With a prediction this unsure, a search follows in any case.
+/// With a prediction this unsure, a search follows in any case, and its place is taken.
 const VERY_POOR: f64 = 6.0;
 /// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
 /// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
@@ -131,7 +131,8 @@ impl Matcher<'_> {
             descend(levels, &problem, search.run())
         });
         let cost = |(pose, fit): &(Pose2, Fit)| problem.cost(fit, *pose);
-        let (pose, fit) = other.filter(|other| cost(other) < cost(&near)).unwrap_or(near);
+        let (pose, fit) =
+            other.filter(|other| unsure > VERY_POOR || cost(other) < cost(&near)).unwrap_or(near);
         let score = points - fit.cost;
         let (hessian, _) = weakness.without(&fit, pose.theta);
         let information = CERTAINTY * hessian + prior.information;
