@@ -376,14 +376,14 @@ fn what_cannot_be_downloaded_and_who_does_not_answer_is_said() {
     let daemon = Daemon::start("robot01");
     let view = View::on_loopback(&daemon);
     let mut page = Browser::start().open(&view.url);
-    page.until("document.querySelector('#state b').textContent === 'waiting for scans'");
+    page.until("document.querySelector('#state b')?.textContent === 'waiting for scans'");
     page.click("[data-format=pgm]");
     page.until("said.className === 'bad' && said.textContent.startsWith('PGM: there is no map')");
     // It is alive until its link is missed.
     daemon.background.signal("-STOP");
-    page.until("document.querySelector('#state b').textContent === 'does not answer'");
+    page.until("document.querySelector('#state b')?.textContent === 'does not answer'");
     daemon.background.signal("-CONT");
-    page.until("document.querySelector('#state b').textContent === 'waiting for scans'");
+    page.until("document.querySelector('#state b')?.textContent === 'waiting for scans'");
 }
 
 /// Counts what is drawn from now on, by colour.
