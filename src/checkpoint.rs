@@ -227,9 +227,6 @@ pub fn seal(
     let mut body = BodyWriter::new()?;
     write(&mut body)?;
     let (body_bytes, body) = body.finish()?;
-    if body_bytes.max(body.len() as u64) > LARGEST / 2 {
-        return Err(io::Error::other(format!("a state of {body_bytes} bytes is too large")));
-    }
     let head = serde_json::to_vec(&Head { body_bytes, ..head })?;
     let mut bytes = Vec::with_capacity(FIXED + head.len() + body.len() + CHECKSUM);
     bytes.extend(MAGIC);
@@ -240,6 +237,9 @@ pub fn seal(
     bytes.extend(body);
     let checksum = Sha256::digest(&bytes);
     bytes.extend_from_slice(&checksum);
+    if body_bytes.max(bytes.len() as u64) > LARGEST {
+        return Err(io::Error::other(format!("a state of {body_bytes} bytes is too large")));
+    }
     Ok(bytes)
 }
 

@@ -75,14 +75,18 @@ impl Store {
         if self.lock.as_ref().zip(found).is_some_and(|(held, found)| is(held, &found)) {
             return Ok(());
         }
-        self.lock = match lock(&self.directory) {
-            Ok(lock) => Some(lock),
+        match lock(&self.directory) {
+            Ok(lock) => {
+                self.lock = Some(lock);
+                // They are of the directory before, if there was one.
+                self.good.clear();
+            }
             Err(TryLockError::WouldBlock) => {
                 return Err(io::Error::other(StoreError::Locked(self.directory.clone())));
             }
             // Where there are no locks, one goes on without.
-            Err(TryLockError::Error(_)) => None,
-        };
+            Err(TryLockError::Error(_)) => {}
+        }
         Ok(())
     }
 
@@ -262,5 +266,14 @@ mod tests {
         assert!(store.write(&good).unwrap().ends_with("checkpoint-0000000020.state"));
         assert_eq!(numbers(&disk), [20, 18]);
         Store::new(&disk, 3).unwrap_err();
+
+        // Another one, with files whose numbers were of ours on the one before.
+        let another = root.path().join("another");
+        fs::create_dir(&another).unwrap();
+        fs::write(another.join("checkpoint-0000000020.state"), b"mine").unwrap();
+        fs::remove_file(&place).unwrap();
+        symlink(&another, &place).unwrap();
+        (0..4).for_each(|_| drop(store.write(&good).unwrap()));
+        assert_eq!(numbers(&another), [24, 23, 22, 20]);
     }
 }
