@@ -12,7 +12,7 @@ use gmapd::slam::gmapping::prepared_scan::PreparedScan;
 use gmapd::slam::gmapping::scan_matcher::FieldMatcher;
 use gmapd::slam::gmapping::{GMapping, MatcherParameters, Parameters, ScanReading, ScanUpdate};
 use gmapd::slam::grid::Cell;
-use gmapd::slam::grid::footprint::Footprint;
+use gmapd::slam::grid::footprint::{Footprint, halved};
 use gmapd::slam::grid::hit_map::HitMap;
 use gmapd::slam::grid::likelihood_field::{
     FULL, Kernel, LikelihoodField, Points, Window, WindowPose,
@@ -359,6 +359,33 @@ proptest! {
         let tiles: BTreeSet<TileKey> = expected.keys().map(|c| TileKey::containing(*c)).collect();
         prop_assert!(tiles.is_subset(&touched));
         prop_assert_eq!(known(map.cells()), expected);
+    }
+}
+
+proptest! {
+    /// An obstacle in one of four cells is one of all; free are they if two are that meet at the
+    /// middle.
+    #[test]
+    fn coarse_cells_are_what_their_four_cells_are(scan in outlines(), pose in poses()) {
+        let [free, occupied] = [0.4, 0.9].map(LogOdds::of_probability);
+        let (mut coarse, mut footprint) = (LogOddsMap::new(0.1), Footprint::default());
+        coarse.add(&halved(footprint.of(&scan, pose, 0.05)), Evidence { free, occupied });
+        let mut counts = OccupancyMap::new(0.05);
+        counts.add(&scan, pose);
+        let fine = seen(&counts);
+        let halves = fine.keys().map(|cell| Cell::new(cell.ix >> 1, cell.iy >> 1));
+        let mut expected = BTreeMap::new();
+        for cell in halves.collect::<BTreeSet<_>>() {
+            let count = |dx, dy| fine.get(&Cell::new(2 * cell.ix + dx, 2 * cell.iy + dy));
+            let is_hit = |dx, dy| count(dx, dy).is_some_and(|count| count.hits > 0);
+            let is_free = |dx, dy| count(dx, dy).is_some_and(|count| count.hits == 0);
+            if is_hit(0, 0) || is_hit(0, 1) || is_hit(1, 0) || is_hit(1, 1) {
+                expected.insert(cell, occupied);
+            } else if is_free(0, 0) && is_free(1, 1) || is_free(1, 0) && is_free(0, 1) {
+                expected.insert(cell, free);
+            }
+        }
+        prop_assert_eq!(known(coarse.cells()), expected);
     }
 }
 

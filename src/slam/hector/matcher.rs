@@ -18,7 +18,7 @@ const FINE_STEPS: usize = 6;
 const POOR: f64 = 0.5;
 /// ... that is, by less than this share of the usual score.
 const WORSE: f64 = 0.95;
-/// With a prediction this unsure, a search follows in any case, and its place is taken.
+/// With a prediction this unsure, a search is made at once.
 const VERY_POOR: f64 = 6.0;
 /// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
 /// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
@@ -123,16 +123,20 @@ impl Matcher<'_> {
         let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
         let deviations = prediction.deviations();
         let unsure = deviations[0].max(deviations[1] * lever) / levels[0].resolution();
-        let near = descend(levels, &problem, pose_in_map);
-        let fits = points - near.1.cost >= WORSE * expected * points;
-        let other = (unsure > VERY_POOR || unsure > POOR && !fits).then(|| {
+        let search = || {
             let gain = SEARCH_GAIN;
             let search = Search { level: &levels[0], prior: &prior, deviations, lever, gain };
             descend(levels, &problem, search.run())
-        });
-        let cost = |(pose, fit): &(Pose2, Fit)| problem.cost(fit, *pose);
-        let (pose, fit) =
-            other.filter(|other| unsure > VERY_POOR || cost(other) < cost(&near)).unwrap_or(near);
+        };
+        let (pose, fit) = if unsure > VERY_POOR {
+            search()
+        } else {
+            let near = descend(levels, &problem, pose_in_map);
+            let fits = points - near.1.cost >= WORSE * expected * points;
+            let cost = |found: &(Pose2, Fit)| problem.cost(&found.1, found.0);
+            let other = (unsure > POOR && !fits).then(search);
+            other.filter(|other| cost(other) < cost(&near)).unwrap_or(near)
+        };
         let score = points - fit.cost;
         let (hessian, _) = weakness.without(&fit, pose.theta);
         let information = CERTAINTY * hessian + prior.information;

@@ -65,13 +65,14 @@ impl Pyramid {
         mut touched: impl FnMut(TileKey),
     ) {
         let (finest, coarse) = self.maps.split_first_mut().expect("there is a finest map");
-        let seen = self.footprint.of(&scan.outline, pose_in_map, finest.resolution());
+        let mut seen = self.footprint.of(&scan.outline, pose_in_map, finest.resolution());
         finest.add(seen, self.evidence);
         seen.iter().for_each(|(tile, _)| touched(*tile));
-        let mut seen = seen.to_vec();
+        let mut halves;
         for map in coarse {
-            seen = halved(&seen);
-            map.add(&seen, self.evidence);
+            halves = halved(seen);
+            map.add(&halves, self.evidence);
+            seen = &halves;
         }
     }
 
