@@ -373,9 +373,12 @@ async fn a_message_that_is_far_too_large_is_dropped_before_it_is_whole() {
     let client = zenoh::open(zenoh::Config::from_json5(&config).unwrap()).await.unwrap();
     let scans = client.declare_publisher("robot01/scan");
     let scans = scans.congestion_control(CongestionControl::Block).await.unwrap();
-    while !scans.matching_status().await.unwrap().matching() {
-        tokio::task::yield_now().await;
-    }
+    let listened_to = async {
+        while !scans.matching_status().await.unwrap().matching() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, listened_to).await.unwrap();
     scans.put(vec![0_u8; 200 << 20]).await.unwrap();
     scans.put(vec![0_u8; 5 << 20]).await.unwrap();
     let status = ask_until_answered(&client, "robot01/slam/status").await;

@@ -1,5 +1,6 @@
 //! `gmapd run`: the daemon, until a signal ends it.
 
+use std::convert::Infallible;
 use std::io::IsTerminal as _;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
@@ -151,7 +152,7 @@ async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow:
     let opening = spawn_blocking(move || runtime.block_on(reachable.open_when_reachable(most)));
     let session = tokio::select! {
         session = opening => session.context("the session could not be opened")??,
-        () = tell_waiting(mesh) => return Ok(()),
+        never = tell_waiting(mesh) => match never {},
         () = signals.next() => return Ok(()),
     };
     let robot = settings.prefix.to_string();
@@ -169,8 +170,11 @@ async fn until_signalled(settings: Settings, mesh: &SessionArguments) -> anyhow:
 }
 
 /// Says again and again that nobody has answered yet.
-async fn tell_waiting(mesh: &SessionArguments) {
-    let endpoints = mesh.endpoints().join(", ");
+async fn tell_waiting(mesh: &SessionArguments) -> Infallible {
+    let endpoints = match mesh.endpoints() {
+        [] => "the endpoints of Zenoh's configuration".to_owned(),
+        endpoints => endpoints.join(", "),
+    };
     loop {
         tokio::time::sleep(WAITING).await;
         tracing::warn!(

@@ -259,12 +259,13 @@ impl MapProducts {
     /// The pose of the base at each processed scan in this map.
     #[must_use]
     pub fn path_in(&self, format: PathFormat) -> Bytes {
+        let message = || self.path_message(self.path().iter());
         match format {
             PathFormat::Message(MessageFormat::Cdr) => {
-                self.path_cdr.get_or_init(|| ros::cdr(&self.path_message()).into()).clone()
+                self.path_cdr.get_or_init(|| ros::cdr(&message()).into()).clone()
             }
             PathFormat::Message(MessageFormat::Json) => {
-                self.path_json.get_or_init(|| ros::json(&self.path_message()).into()).clone()
+                self.path_json.get_or_init(|| ros::json(&message()).into()).clone()
             }
             PathFormat::Tum => self.tum(),
         }
@@ -285,12 +286,11 @@ impl MapProducts {
     /// The path as it is published: what it costs does not grow for ever.
     #[must_use]
     pub fn path_excerpt(&self) -> Bytes {
-        let poses: Vec<(Stamp, Pose2)> = self.path().excerpt(PUBLISHED_POSES).collect();
-        ros::cdr(&convert::path(self.header(), &poses)).into()
+        ros::cdr(&self.path_message(self.path().excerpt(PUBLISHED_POSES))).into()
     }
 
-    fn path_message(&self) -> ros::Path {
-        let poses: Vec<(Stamp, Pose2)> = self.path().iter().collect();
+    fn path_message(&self, poses: impl Iterator<Item = (Stamp, Pose2)>) -> ros::Path {
+        let poses: Vec<(Stamp, Pose2)> = poses.collect();
         convert::path(self.header(), &poses)
     }
 
