@@ -191,7 +191,10 @@ impl<'a> Level<'a> {
         }
         four.cells = cells;
         let [columns, rows] = cells.map(indices);
-        for lane in (0..four.count).filter(|lane| stayed & 1 << lane == 0) {
+        let mut left = four.lanes & !stayed;
+        while left != 0 {
+            let lane = left.trailing_zeros() as usize % LANES;
+            left &= left - 1;
             let square = self.window.square(columns[lane], rows[lane]);
             for (corner, cell) in four.squares.iter_mut().zip(square) {
                 corner[lane] = self.probabilities.of(cell);
@@ -291,7 +294,8 @@ fn moved(pose: Pose2, step: Vector3<f64>) -> Pose2 {
 /// all four at once, and a small step leaves most of them in the cells where they were.
 #[derive(Debug)]
 struct Four {
-    count: usize,
+    /// A bit for each.
+    lanes: i32,
     /// In the base frame, cells.
     points: [f32x4; 2],
     /// Of the squares, as [`split`] makes them.
@@ -305,7 +309,7 @@ impl Four {
     fn new(points: &[[f32; 2]]) -> Self {
         let point = |lane: usize| points.get(lane).copied().unwrap_or_default();
         Self {
-            count: points.len(),
+            lanes: EVERY_LANE >> (LANES - points.len()),
             points: [0, 1].map(|axis| f32x4::from([0, 1, 2, 3].map(|lane| point(lane)[axis]))),
             cells: [f32x4::ZERO; 2],
             squares: [[1.0; LANES]; 4],
@@ -346,8 +350,8 @@ fn add(sums: &mut [f32x4; 10], [rx, ry]: [f32x4; 2], square: [f32x4; 4], [fx, fy
 #[inline]
 fn split(positions: f32x4) -> (f32x4, f32x4) {
     let shift = f32x4::splat(8_388_608.0);
-    let cells = positions - 1.0 + shift;
-    (cells, positions - 0.5 - (cells - shift))
+    let cells = positions + (shift - 1.0);
+    (cells, positions - (cells - (shift - 0.5)))
 }
 
 /// Cells that [`split`] made, to look up.

@@ -21,8 +21,10 @@ const WORSE: f64 = 0.95;
 /// With a prediction this unsure, a search is made at once.
 const VERY_POOR: f64 = 6.0;
 /// A match counts if 1 - (1 - M)² is at least this on average over the points, in the finest map or
-/// in the coarsest, where beams leave no gaps; where nothing is known it is 0.75.
+/// in the coarsest, where beams leave no gaps; ...
 const LEAST_EXPLAINED: f64 = 0.7;
+/// ... where nothing is known it is this. A place further around counts if it is more, and as usual.
+const SCORE_OF_NOTHING: f64 = 0.75;
 /// What a residual weighs beside the prediction: 1 / its variance.
 const GAIN: f64 = 1.0;
 /// What a residual tells, once the pose is found: this makes the squared error, normalized,
@@ -44,8 +46,6 @@ pub struct Placed {
     pub score: f64,
     /// How many those are.
     pub points: f64,
-    /// The share of them that lies where the coarsest map knows nothing.
-    pub news: f64,
     /// What the scan does not tell.
     pub weakness: Weakness,
 }
@@ -61,7 +61,6 @@ impl Placed {
             matched: true,
             score: 0.0,
             points: 0.0,
-            news: 1.0,
             weakness,
         }
     }
@@ -69,8 +68,8 @@ impl Placed {
 
 /// The likeliest place of a scan, if scans usually score `expected` a point, up to 1.
 ///
-/// A scan that contradicts the map is looked for further around, and if that does not help either,
-/// it is nowhere in particular there.
+/// A scan that contradicts the map is looked for further around, and if it fits nowhere as usual
+/// either, it is nowhere in particular there.
 #[must_use]
 pub fn place(
     pyramid: &Pyramid,
@@ -90,7 +89,7 @@ pub fn place(
     }
     let lost = prediction.lost();
     let elsewhere = matcher.place(&lost, expected);
-    if elsewhere.matched {
+    if elsewhere.score >= expected.max(SCORE_OF_NOTHING) * elsewhere.points {
         return elsewhere;
     }
     Placed { pose_in_map: lost.pose_in_map, covariance: lost.covariance, ..placed }
@@ -110,15 +109,8 @@ impl Matcher<'_> {
         let &Self { ref levels, weakness, lever } = self;
         let &Prediction { pose_in_map, covariance } = prediction;
         let points = levels.last().map_or(0, |level| level.points().len()) as f64;
-        let unknown = Placed {
-            pose_in_map,
-            covariance,
-            matched: false,
-            score: 0.0,
-            points,
-            news: 0.0,
-            weakness,
-        };
+        let unknown =
+            Placed { pose_in_map, covariance, matched: false, score: 0.0, points, weakness };
         let Some(prior) = prediction.prior() else { return unknown };
         let problem = Problem { prior: &prior, weakness: &weakness, lever, gain: GAIN };
         let deviations = prediction.deviations();
@@ -146,7 +138,6 @@ impl Matcher<'_> {
             matched: score >= LEAST_EXPLAINED * points
                 || levels[0].explains(pose) >= LEAST_EXPLAINED,
             score,
-            news: levels[0].unknown_share(pose),
             ..unknown
         }
     }

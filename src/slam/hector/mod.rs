@@ -212,7 +212,7 @@ impl Hector {
         let placed = self.place(&scan, sweep);
         on_phase(Phase::Match);
         on_phase(Phase::Resample);
-        let registered = self.advance(sweep, &placed) && self.mode == Mode::Mapping;
+        let registered = self.advance(&scan, sweep, &placed) && self.mode == Mode::Mapping;
         if registered {
             let Self { pyramid, output, .. } = self;
             pyramid.add(&scan, placed.pose_in_map, |tile| output.stale.push(tile));
@@ -305,13 +305,14 @@ impl Hector {
     }
 
     /// Goes on to where the scan was taken; whether it is to enter the map.
-    fn advance(&mut self, sweep: &Sweep<'_>, placed: &Placed) -> bool {
+    fn advance(&mut self, scan: &PreparedScan, sweep: &Sweep<'_>, placed: &Placed) -> bool {
         let (pose_in_map, stamp) = (placed.pose_in_map, sweep.scan.stamp);
         let last = self.state.map(|state| state.registered_at);
         let registered = placed.matched
             && last.is_none_or(|last| {
                 let moved = last.between(pose_in_map);
-                (sweep.odom_from_base.is_none() && placed.news > NEWS)
+                let news = || self.pyramid.unknown_share(scan, pose_in_map);
+                (sweep.odom_from_base.is_none() && news() > NEWS)
                     || moved.position().norm() > self.parameters.update_distance
                     || moved.theta.abs() > self.parameters.update_angle
             });

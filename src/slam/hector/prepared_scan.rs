@@ -31,15 +31,14 @@ impl PreparedScan {
     #[must_use]
     pub fn points(&self, resolution: f64) -> Vec<[f32; 2]> {
         let per_metre = (1.0 / resolution) as f32;
-        let mut points: Vec<[f32; 2]> = Vec::with_capacity(self.hits.len());
+        let mut points = Vec::with_capacity(self.hits.len());
+        let mut last = [f32::INFINITY; 2];
         for hit in &self.hits {
             let [x, y] = hit.map(|metres| metres * per_metre);
-            let near = |&[px, py]: &[f32; 2]| {
-                let (dx, dy) = (x - px, y - py);
-                dx * dx + dy * dy < SPACING * SPACING
-            };
-            if !points.last().is_some_and(near) {
-                points.push([x, y]);
+            let (dx, dy) = (x - last[0], y - last[1]);
+            if dx * dx + dy * dy >= SPACING * SPACING {
+                last = [x, y];
+                points.push(last);
             }
         }
         points

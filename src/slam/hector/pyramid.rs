@@ -113,6 +113,13 @@ impl Pyramid {
         })
     }
 
+    /// The share of a scan's points, taken at a pose, that lie where the coarsest map knows nothing.
+    #[must_use]
+    pub fn unknown_share(&self, scan: &PreparedScan, pose_in_map: Pose2) -> f64 {
+        let coarsest = self.levels(scan, pose_in_map).next();
+        coarsest.map_or(1.0, |level| level.unknown_share(pose_in_map))
+    }
+
     /// The tiles of all maps.
     #[must_use]
     pub fn tiles(&self) -> TileCounts {

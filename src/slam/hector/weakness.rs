@@ -72,26 +72,31 @@ impl Weakness {
 /// and how many there are.
 fn surfaces(hits: &[[f32; 2]], lever: f64) -> (Matrix3<f64>, u32) {
     let along = lengths(hits);
-    let (mut sum, mut count) = (Matrix3::zeros(), 0);
+    let per_lever = 1.0 / lever;
+    let [mut xx, mut xy, mut xt, mut yy, mut yt, mut tt] = [0.0; 6];
+    let mut count = 0;
     let (mut first, mut last) = (0, 0);
-    for (index, &[x, y]) in hits.iter().enumerate() {
-        while along[index] - along[first] > REACH {
+    for (&[x, y], here) in hits.iter().zip(&along) {
+        while here - along[first] > REACH {
             first += 1;
         }
-        while last + 1 < hits.len() && along[last + 1] - along[index] <= REACH {
+        while along.get(last + 1).is_some_and(|next| next - here <= REACH) {
             last += 1;
         }
         let (dx, dy) = (hits[last][0] - hits[first][0], hits[last][1] - hits[first][1]);
-        let length = (dx * dx + dy * dy).sqrt();
-        if length < SHORTEST {
+        let squared = dx * dx + dy * dy;
+        if squared < SHORTEST * SHORTEST {
             continue;
         }
-        let (nx, ny) = (f64::from(-dy / length), f64::from(dx / length));
-        let turn = (f64::from(x) * ny - f64::from(y) * nx) / lever;
-        let v = Vector3::new(nx, ny, turn);
-        sum += v * v.transpose();
+        // v times the length of the piece.
+        let [vx, vy, turn] = [-dy, dx, x * dx + y * dy].map(f64::from);
+        let (share, vt) = (1.0 / f64::from(squared), per_lever * turn);
+        let [sx, sy, st] = [vx, vy, vt].map(|value| share * value);
+        (xx, xy, xt) = (xx + sx * vx, xy + sx * vy, xt + sx * vt);
+        (yy, yt, tt) = (yy + sy * vy, yt + sy * vt, tt + st * vt);
         count += 1;
     }
+    let sum = Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, tt);
     (sum, count)
 }
 
