@@ -90,10 +90,6 @@ pub struct Footprint {
 struct Crossing(u32);
 
 impl Crossing {
-    const fn new(column: u32, goes_up: bool) -> Self {
-        Self(column << 1 | goes_up as u32)
-    }
-
     const fn column(self) -> usize {
         (self.0 >> 1) as usize
     }
@@ -336,7 +332,8 @@ fn cross_rows(rows: &mut [Vec<Crossing>], first: Cell, a: Corner, b: Corner) {
     let rows = &mut rows[(low.row - first.iy) as usize..(high.row - first.iy) as usize];
     for (iy, row) in (low.row..).zip(rows) {
         let x = low.at.x + slope * (f64::from(iy) + 0.5 - low.at.y);
-        row.push(Crossing::new((first_centre(x) - first.ix) as u32, goes_up));
+        let column = (first_centre(x) - first.ix) as u32;
+        row.push(Crossing(column << 1 | u32::from(goes_up)));
     }
 }
 
