@@ -168,8 +168,8 @@ fn hector_maps_intel_with_odometry_and_without() {
     }
 }
 
-/// With the cells that it has if nobody says otherwise, from poses that differ by little: where a
-/// scan contradicts the map, many of them decide alone whether the robot is lost.
+/// With the cells that it has if nobody says otherwise. Where a scan contradicts the map, it is the
+/// start pose that decides what is taken for a match, so there are several, which differ by little.
 #[test]
 fn hector_maps_intel_in_fine_cells_from_any_pose() {
     let (Some(log), Some(relations)) =

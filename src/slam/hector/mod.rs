@@ -312,9 +312,9 @@ impl Hector {
             && last.is_none_or(|last| {
                 let moved = last.between(pose_in_map);
                 let news = || self.pyramid.unknown_share(scan, pose_in_map);
-                (sweep.odom_from_base.is_none() && news() > NEWS)
-                    || moved.position().norm() > self.parameters.update_distance
+                moved.position().norm() > self.parameters.update_distance
                     || moved.theta.abs() > self.parameters.update_angle
+                    || (sweep.odom_from_base.is_none() && news() > NEWS)
             });
         let velocity = self.state.filter(|_| placed.matched).and_then(|state| {
             let seconds = stamp.seconds_since(state.stamp);
