@@ -145,6 +145,15 @@ impl Robot {
         }
     }
 
+    /// Waits until nobody is linked: what the dead declared may not have been read yet.
+    async fn until_alone(&self) {
+        let start = clock::now();
+        while self.session.info().transports().await.next().is_some() {
+            assert!(start.elapsed() < PATIENCE, "the daemon stays");
+            tokio::task::yield_now().await;
+        }
+    }
+
     async fn send(&self, moment: &Moment) {
         self.odom.put(&*moment.odometry).await.unwrap();
         self.scan.put(&*moment.scan).await.unwrap();
@@ -445,6 +454,7 @@ async fn nip_in_the_bud(mesh: &Mesh, robot: &Robot, victim: &Victim, rng: &mut C
     let daemon = Daemon::spawn(mesh, &robot.name, &arguments);
     tokio::time::sleep(Duration::from_millis(rng.random_range(0..150))).await;
     daemon.kill(robot).await;
+    robot.until_alone().await;
 }
 
 /// Kills that came while a checkpoint was being written.
