@@ -26,6 +26,8 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 PHASES = ["match", "resample", "register", "map"]
 PARTICLES = [30, 100, 500]
 THREADS = [1, 2]
+# In place of a number of particles; it has one thread.
+HECTOR = "Hector"
 
 
 @dataclasses.dataclass
@@ -51,7 +53,7 @@ def main():
         sizes = (PARTICLES[:1], THREADS[:1]) if arguments.quick else (PARTICLES, THREADS)
         runs = []
         for log in logs:
-            for particles, threads in itertools.product(*sizes):
+            for particles, threads in [(HECTOR, 1), *itertools.product(*sizes)]:
                 runs.append(measure(gmapd, log, particles, threads, scratch))
                 tell(runs[-1])
         instructions = count_instructions(gmapd, logs[0], scratch) if arguments.callgrind else None
@@ -69,7 +71,7 @@ def parse_arguments():
     parser.add_argument("--out", type=pathlib.Path, help="directory to make for the report")
     parser.add_argument("--gmapd", type=pathlib.Path, help="program to measure; built if not given")
     parser.add_argument("--callgrind", action="store_true", help="count instructions (valgrind)")
-    parser.add_argument("--quick", action="store_true", help="30 particles on one thread only")
+    parser.add_argument("--quick", action="store_true", help="Hector, and 30 particles on one thread")
     return parser.parse_args()
 
 
@@ -110,6 +112,8 @@ def run(command):
 
 
 def replay_command(gmapd, log, particles, threads):
+    if particles == HECTOR:
+        return [gmapd, "replay", log.path, "--engine", "hector", "--json"]
     settings = [f"particles={particles}", *log.settings]
     options = [word for setting in settings for word in ("--set", setting)]
     return [gmapd, "replay", log.path, *options, "--threads", threads, "--json"]
@@ -186,9 +190,10 @@ def commit():
 
 
 def tell(measured):
-    scan = measured["timing"]["scan"]["cpu_ms"]
-    print(f"{measured['log']}: {measured['particles']} particles, {measured['threads']} threads: "
-          f"{scan['mean']:.2f} ms a scan", file=sys.stderr)
+    scan, particles = measured["timing"]["scan"]["cpu_ms"], measured["particles"]
+    engine = HECTOR if particles == HECTOR else f"{particles} particles"
+    print(f"{measured['log']}: {engine}, {measured['threads']} threads: "
+          f"{scan['mean']:.3f} ms a scan", file=sys.stderr)
 
 
 def report(raw):
@@ -199,12 +204,13 @@ def report(raw):
         f"- Commit: `{raw['commit']}`.",
         f"- Command: `benches/report.py DATA{command_options(raw)}`, which runs "
         "`gmapd replay LOG --set particles=N --threads T --json` with slam_gmapping's defaults "
-        "and the settings named below, seed 1.",
+        "and the settings named below, seed 1, and `gmapd replay LOG --engine hector --json`.",
         "- Raw figures: `runs.json`.\n",
         "Settings: " + "; ".join(settings(runs)) + ".\n",
         "## Accuracy and cost\n",
         "CPU and wall are milliseconds a processed scan, the whole of the filter and the output "
-        "map; CPU is that of all threads together.",
+        "map; CPU is that of all threads together. Hector processes every scan, GMapping those "
+        "after a way or a turn.",
         "Error is the mean over the log's relations, where it has any.\n",
         table(["log", "particles", "threads", "error m", "error degrees", "CPU mean", "p50", "p99",
                "wall mean", "times real time", "peak MB", "tiles MB", "resampled"],
@@ -225,7 +231,8 @@ def report(raw):
 
 
 def command_options(raw):
-    options = "" if {run["particles"] for run in raw["runs"]} == set(PARTICLES) else " --quick"
+    found = {run["particles"] for run in raw["runs"]}
+    options = "" if found == {HECTOR, *PARTICLES} else " --quick"
     return options + (" --callgrind" if raw["instructions"] else "")
 
 
@@ -260,7 +267,7 @@ def same_results(runs):
     if len(threads) == 1:
         return "Not measured: all runs had the same number of threads."
     hashes = {}
-    for measured in runs:
+    for measured in (run for run in runs if run["particles"] != HECTOR):
         key = (measured["log"], measured["particles"])
         hashes.setdefault(key, set()).add(json.dumps(measured["sha256"], sort_keys=True))
     differing = [f"{log} with {count} particles" for (log, count), found in hashes.items()

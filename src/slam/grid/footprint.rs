@@ -103,6 +103,7 @@ impl Crossing {
 /// A tile of the row of tiles that is looked at.
 #[derive(Debug, Clone, Copy, Default)]
 struct Column {
+    /// Of the free, those cells that are not as their row is from this tile on.
     seen: Seen,
     /// Whether it holds anything yet.
     touched: bool,
@@ -123,13 +124,12 @@ impl Footprint {
         self.outline(scan, map_from_base, resolution);
         let (low, high) = self.bounds();
         self.fill_rows(low, high);
+        let width = (high.tx - low.tx + 1) as usize;
         let (rows, _) = self.rows.as_chunks_mut::<TILE_SIZE>();
         for ((ty, rows), hits) in (low.ty..=high.ty).zip(rows).zip(&mut self.hits_by_row) {
             for (row, crossings) in rows.iter_mut().enumerate() {
                 crossings.sort_unstable();
-                for_each_inside(crossings, |start, end| {
-                    push_free(&mut self.columns, row, start, end);
-                });
+                mark_edges(&mut self.columns, row, crossings);
                 crossings.clear();
             }
             for hit in hits.drain(..) {
@@ -137,10 +137,12 @@ impl Footprint {
                 self.columns[(tile - low.tx) as usize].push_hit(place(hit.iy).1, column);
             }
             let mut whole = 0;
-            for (tx, column) in (low.tx..=high.tx).zip(&mut self.columns) {
-                whole ^= std::mem::take(&mut column.toggled);
-                if whole != 0 || column.touched {
-                    self.tiles.push((TileKey { ty, tx }, column.finish(whole)));
+            for (tx, column) in (low.tx..).zip(&mut self.columns[..width]) {
+                whole ^= column.toggled;
+                if (whole != 0 || column.touched)
+                    && let Some(seen) = column.finish(whole)
+                {
+                    self.tiles.push((TileKey { ty, tx }, seen));
                 }
             }
         }
@@ -239,8 +241,10 @@ const fn place(index: i32) -> (i32, usize) {
 }
 
 impl Column {
-    fn push_free(&mut self, row: usize, columns: u16) {
-        self.seen.free[row] |= columns;
+    /// From this column on to the right, the row is the other way round.
+    fn flip(&mut self, row: usize, column: usize) {
+        self.seen.free[row] ^= !(u16::MAX << column);
+        self.toggled ^= 1 << row;
         self.touched = true;
     }
 
@@ -249,33 +253,32 @@ impl Column {
         self.touched = true;
     }
 
-    /// What was seen, with the rows that are free as a whole; begins anew.
-    fn finish(&mut self, whole_rows: u16) -> Seen {
-        self.touched = false;
-        let mut seen = std::mem::take(&mut self.seen);
+    /// What was seen, if anything, with the rows that are free from here on; begins anew.
+    fn finish(&mut self, whole_rows: u16) -> Option<Seen> {
+        let Self { mut seen, .. } = std::mem::take(self);
+        let mut any = 0;
         for row in 0..TILE_SIZE {
             let whole = if whole_rows & 1 << row == 0 { 0 } else { u16::MAX };
             // An obstacle beats free space within a scan.
-            seen.free[row] = (seen.free[row] | whole) & !seen.hit[row];
+            seen.free[row] = (seen.free[row] ^ whole) & !seen.hit[row];
+            any |= seen.free[row] | seen.hit[row];
         }
-        seen
+        (any != 0).then_some(seen)
     }
 }
 
-/// Takes the cells of a row from `start` up to `end`, not included, as free.
-fn push_free(columns: &mut [Column], row: usize, start: usize, end: usize) {
-    let (first, last) = (start / TILE_SIZE, end / TILE_SIZE);
-    let from_start = u16::MAX << (start % TILE_SIZE);
-    let before_end = !(u16::MAX << (end % TILE_SIZE));
-    if first == last {
-        return columns[first].push_free(row, from_start & before_end);
+/// Turns the row round at each edge of the polygon, by the non-zero winding rule: beams that overlap
+/// after a full turn do not cancel each other.
+fn mark_edges(columns: &mut [Column], row: usize, crossings: &[Crossing]) {
+    let mut winding = 0;
+    for crossing in crossings {
+        let outside = winding == 0;
+        winding += crossing.direction();
+        if outside || winding == 0 {
+            let column = crossing.column();
+            columns[column / TILE_SIZE].flip(row, column % TILE_SIZE);
+        }
     }
-    columns[first].push_free(row, from_start);
-    if before_end != 0 {
-        columns[last].push_free(row, before_end);
-    }
-    columns[first + 1].toggled ^= 1 << row;
-    columns[last].toggled ^= 1 << row;
 }
 
 /// From the sensor to the end of a beam, in cells.
@@ -330,10 +333,12 @@ fn cross_rows(rows: &mut [Vec<Crossing>], first: Cell, a: Corner, b: Corner) {
     let (low, high) = if goes_up { (a, b) } else { (b, a) };
     let slope = (high.at.x - low.at.x) / (high.at.y - low.at.y);
     let rows = &mut rows[(low.row - first.iy) as usize..(high.row - first.iy) as usize];
-    for (iy, row) in (low.row..).zip(rows) {
-        let x = low.at.x + slope * (f64::from(iy) + 0.5 - low.at.y);
-        let column = (first_centre(x) - first.ix) as u32;
+    let start = low.at.x - f64::from(first.ix);
+    let mut height = f64::from(low.row) + 0.5 - low.at.y;
+    for row in rows {
+        let column = nearest(start + slope * height);
         row.push(Crossing(column << 1 | u32::from(goes_up)));
+        height += 1.0;
     }
 }
 
@@ -342,18 +347,8 @@ fn first_centre(x: f64) -> i32 {
     -floor(0.5 - x)
 }
 
-/// Calls `take` with the first and one past the last cell of each stretch inside the polygon, by
-/// the non-zero winding rule: beams that overlap after a full turn do not cancel each other.
-fn for_each_inside(crossings: &[Crossing], mut take: impl FnMut(usize, usize)) {
-    let mut winding = 0;
-    let mut start = 0;
-    for crossing in crossings {
-        if winding == 0 {
-            start = crossing.column();
-        }
-        winding += crossing.direction();
-        if winding == 0 && start < crossing.column() {
-            take(start, crossing.column());
-        }
-    }
+/// The nearest whole number to one that is hardly negative: adding 1.5 times 2^52 leaves no room for
+/// digits behind the point.
+const fn nearest(value: f64) -> u32 {
+    (value + 6_755_399_441_055_744.0).to_bits() as u32
 }

@@ -159,8 +159,8 @@ impl LogOddsMap {
                 continue;
             }
             let (rows, _) = tile.as_chunks_mut::<TILE_SIZE>();
-            for ((row, free), hit) in rows.iter_mut().zip(seen.free).zip(seen.hit) {
-                evidence.enter(row, free, hit);
+            for ((row, free), hit) in rows.iter_mut().zip(&seen.free).zip(&seen.hit) {
+                evidence.enter(row, *free, *hit);
             }
         }
     }

@@ -195,7 +195,7 @@ impl<'a> Level<'a> {
         while left != 0 {
             let lane = left.trailing_zeros() as usize % LANES;
             left &= left - 1;
-            let square = self.window.square(columns[lane], rows[lane]);
+            let square = self.window.square(columns[lane] as usize, rows[lane] as usize);
             for (corner, cell) in four.squares.iter_mut().zip(square) {
                 corner[lane] = self.probabilities.of(cell);
             }
@@ -356,6 +356,6 @@ fn split(positions: f32x4) -> (f32x4, f32x4) {
 
 /// Cells that [`split`] made, to look up.
 #[inline]
-fn indices(cells: f32x4) -> [usize; LANES] {
-    cells.to_array().map(|cell| (cell.to_bits() & 0x007f_ffff) as usize)
+fn indices(cells: f32x4) -> [u32; LANES] {
+    cells.to_array().map(|cell| cell.to_bits() & 0x007f_ffff)
 }

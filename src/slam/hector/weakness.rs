@@ -80,7 +80,7 @@ fn surfaces(hits: &[[f32; 2]], lever: f64) -> (Matrix3<f64>, u32) {
         while here - along[first] > REACH {
             first += 1;
         }
-        while along.get(last + 1).is_some_and(|next| next - here <= REACH) {
+        while along[last + 1] - here <= REACH {
             last += 1;
         }
         let (dx, dy) = (hits[last][0] - hits[first][0], hits[last][1] - hits[first][1]);
@@ -100,7 +100,8 @@ fn surfaces(hits: &[[f32; 2]], lever: f64) -> (Matrix3<f64>, u32) {
     (sum, count)
 }
 
-/// Distance along the surfaces to each hit; where one ends, a long way to the next.
+/// Distance along the surfaces to each hit; where one ends, a long way to the next, and no way leads
+/// beyond the last.
 fn lengths(hits: &[[f32; 2]]) -> Vec<f64> {
     let mut length = 0.0;
     let mut before: Option<[f32; 2]> = None;
@@ -113,5 +114,5 @@ fn lengths(hits: &[[f32; 2]]) -> Vec<f64> {
         }
         length
     };
-    hits.iter().map(step).collect()
+    hits.iter().map(step).chain([f64::INFINITY]).collect()
 }
