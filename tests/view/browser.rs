@@ -10,6 +10,7 @@ use tempfile::TempDir;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
+use crate::http;
 use crate::processes::{Background, PATIENCE, directory, text};
 
 /// What it may be called; `CHROMIUM` names another.
@@ -70,7 +71,7 @@ impl Browser {
     fn call(&mut self, session: &str, method: &str, parameters: &Value) -> Value {
         let id = self.send(session, method, parameters);
         loop {
-            let message = self.tools.read();
+            let message = http::message(&mut self.tools);
             let message = message.unwrap_or_else(|error| panic!("{method} {parameters}: {error}"));
             let Ok(text) = message.into_text() else { continue };
             let mut answer: Value = serde_json::from_str(&text).unwrap_or_default();

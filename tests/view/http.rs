@@ -1,9 +1,11 @@
-//! Requests of HTTP/1.1, with any headers.
+//! Requests of HTTP/1.1, with any headers, and messages of WebSockets.
 
-use std::io::{Read as _, Write as _};
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::TcpStream;
 
 use serde_json::Value;
+use tungstenite::stream::MaybeTlsStream;
+use tungstenite::{Error, Message, Result, WebSocket};
 
 use crate::processes::PATIENCE;
 
@@ -60,4 +62,14 @@ fn ask(host: &str, what: &str, (headers, body): (&[(&str, &str)], &str)) -> Answ
     let head = String::from_utf8(answer).expect("a head is text");
     let status = head.split(' ').nth(1).and_then(|code| code.parse().ok());
     Answer { status: status.expect("there is a code"), head, body }
+}
+
+/// The next message; a read that the system interrupts is begun again.
+pub(crate) fn message(socket: &mut WebSocket<MaybeTlsStream<TcpStream>>) -> Result<Message> {
+    loop {
+        match socket.read() {
+            Err(Error::Io(error)) if error.kind() == ErrorKind::Interrupted => {}
+            message => return message,
+        }
+    }
 }

@@ -73,7 +73,7 @@ struct Socket(WebSocket<MaybeTlsStream<TcpStream>>);
 
 impl Socket {
     fn message(&mut self) -> Message {
-        self.0.read().expect("another message comes")
+        http::message(&mut self.0).expect("another message comes")
     }
 
     /// The next value of a kind for which this holds.
