@@ -128,7 +128,7 @@ def measure(gmapd, log, particles, threads, scratch):
         sys.exit("a debug build measures nothing")
     return {
         "log": log.name,
-        "settings": log.settings,
+        "settings": [] if particles == HECTOR else log.settings,
         "particles": particles,
         "threads": threads,
         "accuracy": accuracy(gmapd, out / "trajectory.tum", log.relations),
@@ -204,7 +204,8 @@ def report(raw):
         f"- Commit: `{raw['commit']}`.",
         f"- Command: `benches/report.py DATA{command_options(raw)}`, which runs "
         "`gmapd replay LOG --set particles=N --threads T --json` with slam_gmapping's defaults "
-        "and the settings named below, seed 1, and `gmapd replay LOG --engine hector --json`.",
+        "and the settings named below, seed 1, and `gmapd replay LOG --engine hector --json` with "
+        "Hector's defaults.",
         "- Raw figures: `runs.json`.\n",
         "Settings: " + "; ".join(settings(runs)) + ".\n",
         "## Accuracy and cost\n",

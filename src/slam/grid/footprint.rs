@@ -84,8 +84,8 @@ pub struct Footprint {
 }
 
 /// Where an edge of the polygon crosses the middle of a row of cells: twice the first cell whose
-/// centre is not before it, counted from the first column that is used, and 1 more for an edge that
-/// goes up. As one number, they are sorted quickly.
+/// centre is behind it (one on it may be either), counted from the first column that is used, and 1
+/// more for an edge that goes up. As one number, they are sorted quickly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Crossing(u32);
 

@@ -89,7 +89,7 @@ pub fn place(
     }
     let lost = prediction.lost();
     let elsewhere = matcher.place(&lost, expected);
-    if elsewhere.score >= expected.max(SCORE_OF_NOTHING) * elsewhere.points {
+    if elsewhere.score > expected.max(SCORE_OF_NOTHING) * elsewhere.points {
         return elsewhere;
     }
     Placed { pose_in_map: lost.pose_in_map, covariance: lost.covariance, ..placed }
