@@ -117,13 +117,6 @@ impl Mesh {
     }
 }
 
-/// How many take what a robot sends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Daemons {
-    None,
-    One,
-}
-
 /// What feeds one daemon, and asks it.
 struct Robot {
     name: String,
@@ -134,13 +127,13 @@ struct Robot {
 }
 
 impl Robot {
-    async fn until(&self, expected: Daemons) {
+    /// Waits until a daemon listens.
+    async fn until_heard(&self) {
         for publisher in [&self.odom, &self.scan] {
             let listener = publisher.matching_listener().await.unwrap();
-            let there = expected == Daemons::One;
-            while publisher.matching_status().await.unwrap().matching() != there {
+            while !publisher.matching_status().await.unwrap().matching() {
                 let changed = tokio::time::timeout(PATIENCE, listener.recv_async());
-                changed.await.expect("the daemon comes and goes").unwrap();
+                changed.await.expect("the daemon comes").unwrap();
             }
         }
     }
@@ -244,14 +237,14 @@ impl Daemon {
 
     async fn start(mesh: &Mesh, robot: &Robot, arguments: &[&str]) -> Self {
         let daemon = Self::spawn(mesh, &robot.name, arguments);
-        robot.until(Daemons::One).await;
+        robot.until_heard().await;
         daemon
     }
 
     async fn kill(mut self, robot: &Robot) {
         self.0.kill().unwrap();
         self.0.wait().unwrap();
-        robot.until(Daemons::None).await;
+        robot.until_alone().await;
         // Verdicts of the dead are none of the next.
         while robot.verdicts.try_recv().unwrap().is_some() {}
     }
@@ -260,7 +253,7 @@ impl Daemon {
         let id = self.0.id().to_string();
         assert!(Command::new("kill").arg(id).status().unwrap().success());
         assert!(self.0.wait().unwrap().success());
-        robot.until(Daemons::None).await;
+        robot.until_alone().await;
     }
 }
 
@@ -454,7 +447,6 @@ async fn nip_in_the_bud(mesh: &Mesh, robot: &Robot, victim: &Victim, rng: &mut C
     let daemon = Daemon::spawn(mesh, &robot.name, &arguments);
     tokio::time::sleep(Duration::from_millis(rng.random_range(0..150))).await;
     daemon.kill(robot).await;
-    robot.until_alone().await;
 }
 
 /// Kills that came while a checkpoint was being written.
@@ -625,7 +617,7 @@ async fn what_cannot_be_written_is_told_and_mapping_goes_on() {
     let script = r#"trap "" XFSZ; ulimit -f 32; exec "$0" "$@""#;
     limited.args(["-c", script, env!("CARGO_BIN_EXE_gmapd")]);
     let daemon = Daemon::of(limited, &mesh, "robot01", &EVERY_SCAN);
-    robot.until(Daemons::One).await;
+    robot.until_heard().await;
     robot.feed_all(&moments[..2]).await;
     let before = robot.until_checkpoint(|status| status["written"].as_u64() > Some(0)).await;
     assert_eq!(before["error"], Value::Null);
@@ -723,7 +715,7 @@ async fn on_a_full_or_read_only_disk_mapping_goes_on_and_what_is_there_stays() {
     let robot = mesh.robot("robot01").await;
     let gmapd = || disk.command(&[env!("CARGO_BIN_EXE_gmapd")]);
     let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
-    robot.until(Daemons::One).await;
+    robot.until_heard().await;
     robot.feed_all(&moments[..20]).await;
     robot.until_checkpoint(|status| status["last"]["scans"] == 20).await;
     disk.fill();
@@ -737,7 +729,7 @@ async fn on_a_full_or_read_only_disk_mapping_goes_on_and_what_is_there_stays() {
     let mut remount = disk.command(&["mount", "-o", "remount,ro"]);
     assert!(remount.arg(&disk.mounted_on).status().unwrap().success());
     let daemon = Daemon::of(gmapd(), &mesh, "robot01", &EVERY_SCAN);
-    robot.until(Daemons::One).await;
+    robot.until_heard().await;
     let checkpoint = robot.status().await["checkpoint"].take();
     assert_eq!(checkpoint["resumed_from"], status["last"]["file"]);
     assert_eq!(checkpoint["resumed_stamp"], moments[59].stamp);

@@ -124,7 +124,6 @@ impl Footprint {
         self.outline(scan, map_from_base, resolution);
         let (low, high) = self.bounds();
         self.fill_rows(low, high);
-        let width = (high.tx - low.tx + 1) as usize;
         let (rows, _) = self.rows.as_chunks_mut::<TILE_SIZE>();
         for ((ty, rows), hits) in (low.ty..=high.ty).zip(rows).zip(&mut self.hits_by_row) {
             for (row, crossings) in rows.iter_mut().enumerate() {
@@ -137,7 +136,7 @@ impl Footprint {
                 self.columns[(tile - low.tx) as usize].push_hit(place(hit.iy).1, column);
             }
             let mut whole = 0;
-            for (tx, column) in (low.tx..).zip(&mut self.columns[..width]) {
+            for (tx, column) in (low.tx..).zip(&mut self.columns) {
                 whole ^= column.toggled;
                 if (whole != 0 || column.touched)
                     && let Some(seen) = column.finish(whole)
@@ -217,7 +216,7 @@ impl Footprint {
         let width = (high.tx - low.tx + 1) as usize;
         grow(&mut self.rows, height * TILE_SIZE);
         grow(&mut self.hits_by_row, height);
-        grow(&mut self.columns, width);
+        self.columns.resize(width, Column::default());
         let first = low.first_cell();
         let corner = |at: &Point2| Corner { at: *at, row: first_centre(at.y) };
         let mut before = corner(&self.corners[self.corners.len() - 1]);
