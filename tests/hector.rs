@@ -152,6 +152,31 @@ fn displaced_scans_are_recovered_and_the_covariance_is_that_of_the_errors() {
     }
 }
 
+/// Where a scan contradicts the map, the edge of what is known is no better: all that lies beyond
+/// scores 0.75, wherever the robot is.
+#[test]
+fn a_scan_that_contradicts_is_not_moved_to_where_nothing_is_known() {
+    let parameters = Parameters { max_range: 3.0, ..Parameters::default() };
+    let lidar = full_circle(360);
+    let mut directions = Directions::default();
+    let mut scan = |range: fn(usize) -> f32| {
+        let ranges = (0..360).map(range).collect();
+        let scan = Scan { stamp: Stamp(0), geometry: lidar.geometry, ranges };
+        directions.prepare(&scan, &lidar.mount, &parameters)
+    };
+    let nothing_near = scan(|_| 5.0);
+    let something_ahead = scan(|beam| if (160..200).contains(&beam) { 2.0 } else { 5.0 });
+    let mut pyramid = Pyramid::new(&parameters);
+    for _ in 0..20 {
+        pyramid.add(&nothing_near, Pose2::IDENTITY, |_| ());
+    }
+    let here = Prediction::within(Pose2::IDENTITY, [0.05, 0.02]);
+    for expected in [0.5, 0.9] {
+        let placed = matcher::place(&pyramid, &something_ahead, &here, expected);
+        assert_eq!((placed.matched, placed.pose_in_map), (false, Pose2::IDENTITY));
+    }
+}
+
 fn report(update: ScanUpdate) -> ScanReport {
     match update {
         ScanUpdate::Processed(report) => report,

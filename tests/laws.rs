@@ -347,9 +347,12 @@ proptest! {
             let pose = near * Pose2::new(*beside, -*beside, *turn);
             let tiles = footprint.of(scan, pose, 0.05);
             map.add(tiles, Evidence { free, occupied });
-            touched.extend(tiles.iter().map(|(tile, _)| *tile));
+            let told: BTreeSet<TileKey> = tiles.iter().map(|(tile, _)| *tile).collect();
             let mut counts = OccupancyMap::new(0.05);
             counts.add(scan, pose);
+            let of_cells = seen(&counts).into_keys().map(TileKey::containing).collect();
+            prop_assert_eq!(&told, &of_cells, "none is told of which nothing was seen");
+            touched.extend(told);
             for (cell, count) in seen(&counts) {
                 let value = expected.entry(cell).or_default();
                 *value = value.and(if count.hits > 0 { occupied } else { free });
